@@ -53,11 +53,7 @@ class Cubemap3DGSMethod(SplatMethod):
     _views_per_step = 1  # training views of an iteration, for the scene of `fit`
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
-        """Train on views cut from the panoramas; an iteration covers the sphere once.
-
-        Raises:
-            ValueError: a training view is no panorama.
-        """
+        """Train on views cut from the panoramas; an iteration covers the sphere once."""
         cut = perspective_scene(scene, self.turns(), self.lens)
         self._views_per_step = self._views_per_panorama(scene, cut)
         return super().fit(cut, budget, stage=stage)

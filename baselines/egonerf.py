@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import torch
 
 from padgs.methods.egonerf.field import EgoNeRF
 from padgs.methods.egonerf.model import EgoNeRFModel, RayTrainer
-from padgs.methods.egonerf.options import EgoNeRFOptions, EgoNeRFTraining
+from padgs.methods.egonerf.options import EgoNeRFOptions
 from padgs.render import RenderConfig
 from padgs.scene import Scene
 from padgs.training.loop import Stage
@@ -19,28 +19,14 @@ from padgs.training.options import Budget, TrainOptions
 BACKENDS = ("auto", "torch")
 
 
-@dataclass(frozen=True)
-class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
-    """The `method` group of the configuration: the model and its training."""
-
-    def __post_init__(self) -> None:
-        EgoNeRFOptions.__post_init__(self)
-        EgoNeRFTraining.__post_init__(self)
-        if self.environment_pretraining and self.environment is False:
-            raise ValueError(
-                f"environment_pretraining is {self.environment_pretraining}, but environment is false; "
-                "change one of them"
-            )
-
-
 class EgoNeRFMethod(Method):
     """See `padgs.training.method.Method`; most options of renderer and loss do not apply."""
 
-    Options = EgoNeRFMethodOptions
+    Options = EgoNeRFOptions
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
     def refuse_budget(self, budget: Budget) -> None:
-        """Also refuse numbers of Gaussians, validation views, and runs shorter than the pretraining."""
+        """Also refuse numbers of Gaussians and validation views."""
         super().refuse_budget(budget)
         if budget.gaussians is not None:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
@@ -48,8 +34,6 @@ class EgoNeRFMethod(Method):
             raise ValueError(
                 "budget.stop is auto, which needs validation views, but rays come from all views; set it to end"
             )
-        if budget.seconds is None:  # with seconds the length is measured
-            self.options.refuse_length(budget.iterations)
 
     def refuse_search(self) -> None:
         """Refuse: there are no Gaussians."""
@@ -57,7 +41,7 @@ class EgoNeRFMethod(Method):
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
         """See `Method.build_model`."""
-        return EgoNeRFModel(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
+        return EgoNeRFModel(EgoNeRF.from_scene(scene, self.options, self.seed), iterations)
 
     def restore(self, state: State) -> EgoNeRFModel:
         """See `Method.restore`."""
@@ -65,7 +49,7 @@ class EgoNeRFMethod(Method):
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
         model = EgoNeRF(self.options, centre, *(stored.values[name] for name in ("unit", "travel", "kind")))
         model = model.to(next(iter(stored.tensors.values())).device)
-        return EgoNeRFModel(model, self.options, self.options.environment_pretraining + 1)
+        return EgoNeRFModel(model, 1)
 
     def build_trainer(self, model: EgoNeRFModel, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
         """See `Method.build_trainer`."""

@@ -26,8 +26,7 @@ from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.geometry.panorama import direction, rays, row_latitudes
 from padgs.render.contract import RenderOptions, Request
 from padgs.render.cubemap import FACES
-from padgs.render.projection import PlanarFootprints
-from padgs.render.projection import project
+from padgs.render.projection import PlanarFootprints, project
 
 SIGMAS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # degrees
 LATITUDES = (0.0, 30.0, 45.0, 60.0, 70.0, 80.0, 85.0, 89.0)  # degrees

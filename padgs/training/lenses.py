@@ -181,11 +181,7 @@ class DualLens(nn.Module):
     axis: Tensor
 
     def __init__(self, axis: str = "z", *, order: int = 2, blend: float = 5.0, scene_scale: float = 1.0) -> None:
-        """Build the ideal camera, without gap and bending; `order` is the number K of coefficients, `blend` in degrees.
-
-        Raises:
-            ValueError: unknown axis, or an invalid band.
-        """
+        """Build the ideal camera, without gap and bending; `order` is the number K of coefficients, `blend` degrees."""
         super().__init__()
         self.gap = nn.Parameter(torch.zeros(()))
         self.coefficients = nn.Parameter(torch.zeros(2, order))

@@ -6,16 +6,17 @@ from support.composed import composed
 from support.rates import assert_log_linear
 from support.tiny_scene import in_other_units, squared_error, tiny_scene
 
-from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
+from padgs.baselines.egonerf import EgoNeRFMethod
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.methods.egonerf.field import EgoNeRF
 from padgs.methods.egonerf.model import EgoNeRFModel
+from padgs.methods.egonerf.options import EgoNeRFOptions
 from padgs.render import RenderConfig
 from padgs.runs.run import build_method
 from padgs.scene import Scene, View
 from padgs.training.options import Budget, TrainOptions
 
-SMALL = EgoNeRFMethodOptions(
+SMALL = EgoNeRFOptions(
     radial_nodes=16,
     polar_nodes=12,
     azimuth_nodes=36,
@@ -124,60 +125,20 @@ def test_variation_smooths_the_planes():
 
 def test_published_learning_rates():
     model = EgoNeRF.from_scene(tiny_scene(), SMALL)
-    groups = {group.name: group for group in EgoNeRFModel(model, SMALL, 100_000).groups()}
+    groups = {group.name: group for group in EgoNeRFModel(model, 100_000).groups()}
     starts = {"density": 0.02, "appearance": 0.02, "shader": 1e-3, "environment": 5e-3}
     assert groups.keys() == starts.keys()
     ends = {name: (start, 0.1 * start, [*getattr(model, name).parameters()]) for name, start in starts.items()}
     assert_log_linear(groups.values(), ends, 100_000)
 
 
-@pytest.mark.parametrize("alone", [0, 3])
-def test_rates_decay_to_a_tenth_after_the_environment_learned_alone(alone):
-    """As published for outdoor OmniBlender: at a rate of its own, while nothing else moves and no rate falls."""
-    trained = method(environment_pretraining=alone)
-    records, moved, rates = trained.fit(tiny_scene(), Budget(alone + 4)), [], []
-    before = {name: value.clone() for name, value in EgoNeRF.from_scene(tiny_scene(), SMALL).named_parameters()}
-    for _ in records:
-        now = dict(trained.model.field.named_parameters())
-        moved.append({name for name, value in now.items() if not torch.equal(value, before[name])})
+def test_rates_decay_to_a_tenth():
+    trained = method()
+    for iteration, _ in enumerate(trained.fit(tiny_scene(), Budget(4)), start=1):
         groups = trained._trainer._optimizer.adam.param_groups
         assert {group["betas"] for group in groups} == {(0.9, 0.99)}
-        rates.append([group["lr"] for group in groups][::3])
-        before = {name: value.clone() for name, value in now.items()}
-    assert moved[:alone] == alone * [{"environment.emission"}]
-    assert all(names == before.keys() for names in moved[alone:])
-    assert [environment for _, environment in rates[:alone]] == alone * [0.02]
-    expected = [0.1 ** (iteration / 4) for iteration in range(1, 5)]
-    assert [density / 0.02 for density, _ in rates[alone:]] == pytest.approx(expected)
-    assert [environment / 5e-3 for _, environment in rates[alone:]] == pytest.approx(expected)
-
-
-def test_pretrained_environment_is_the_mean_panorama(room):
-    trained = method(environment_pretraining=200, environment_height=8)
-    records = trained.fit(room, Budget(201))
-    losses = [next(records).loss for _ in range(200)]
-    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
-    colors = torch.cat([view.image().view(-1, 3) for view in room.train])
-    rotations = [view.cam_from_world[:3, :3].float() for view in room.train]
-    rays = room.train[0].camera.rays().reshape(-1, 3)
-    directions = torch.cat([rays @ rotation for rotation in rotations])
-    up = directions[:, 2] > 0.7
-    learned = trained.model.field.environment(directions[up]).mean(0)
-    assert torch.allclose(learned, colors[up].mean(0), atol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("count", "options", "message"),
-    [
-        (5, {}, " of 5 iterations, which leaves none for the g"),
-        (2, {"environment": False}, ", but environment is false"),
-        (2, {"surroundings": "indoor"}, ", but indoors there is no environment"),
-        (-1, {}, "; it must be at least 0"),
-    ],
-)
-def test_impossible_pretraining_is_refused(count, options, message):
-    with pytest.raises(ValueError, match=f"environment_pretraining is {count}{message}"):
-        list(method(environment_pretraining=count, **options).fit(tiny_scene(), Budget(5)))
+        rates = [group["lr"] / start for group, start in zip(groups[::3], (0.02, 5e-3), strict=True)]
+        assert rates == pytest.approx(2 * [0.1 ** (iteration / 4)])
 
 
 def test_published_weights_of_the_variation_fall_like_the_rates():
@@ -186,7 +147,7 @@ def test_published_weights_of_the_variation_fall_like_the_rates():
         for plane in model.appearance.planes:
             plane.mul_(3)  # at first both vary alike, and could be mistaken for one another
     density, appearance = model.density.variation().item(), model.appearance.variation().item()
-    trainable = EgoNeRFModel(model, SMALL, 100_000)
+    trainable = EgoNeRFModel(model, 100_000)
     for iteration, share in ((0, 1.0), (50_000, 0.1**0.5), (100_000, 0.1)):
         expected = 1e-2 * share * (0.1 * density + 0.01 * appearance)
         assert trainable.regularisation(iteration).item() == pytest.approx(expected, rel=1e-5)
@@ -196,4 +157,3 @@ def test_published_training_options():
     options = composed("method=egonerf").options
     assert (options.rays, options.grid_rate, options.network_rate, options.environment_rate) == (4096, 0.02, 1e-3, 5e-3)
     assert (options.rate_decay, options.density_variation, options.appearance_variation) == (0.1, 0.1, 0.01)
-    assert (options.environment_pretraining, options.pretraining_rate) == (0, 0.02)

@@ -128,10 +128,6 @@ def test_going_on_changes_nothing():
         (("method=omnigs", "train.lens=fisheyes_z"), "requires a Panorama camera, not a RayTable"),
         (("method=padgs_ray", "train.lens=fisheyes_z"), "PaD-GS decodes others for each"),
         (("method=cubemap_3dgs", "train.lens=map"), "train.lens is map, but each of the views"),
-        (
-            ("method=egonerf", "method.environment_pretraining=7", "train.iterations=7"),
-            "environment_pretraining is 7 of 7 iterations",
-        ),
         (("method=egonerf", "budget.gaussians=7"), "EgoNeRF has no Gaussians"),
     ],
 )

@@ -121,11 +121,7 @@ class PaDGS(nn.Module):
 
     @classmethod
     def from_scene(cls, scene: Scene, options: PaDGSOptions = PaDGSOptions(), *, seed: int = 0) -> PaDGS:
-        """Return the untrained model of a scene: its point cloud on a grid.
-
-        Raises:
-            ValueError: the point cloud is empty or not finite.
-        """
+        """Return the untrained model of a scene: its point cloud on a grid."""
         automatic = automatic_voxel_size(scene, options.voxel_pixels)
         voxel_size = automatic if options.voxel_size == "auto" else float(options.voxel_size)
         positions = anchors_from_points(scene.points, voxel_size)
@@ -146,11 +142,7 @@ class PaDGS(nn.Module):
         return {"offsets": self.offsets, "features": self.features, "log_scales": self.log_scales}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Copy the `state_dict` of another model, whose number of anchors may differ.
-
-        Raises:
-            ValueError: as `padgs.training.optimizer.load_rows`.
-        """
+        """Copy the `state_dict` of another model, whose number of anchors may differ."""
         load_rows(self, tensors, ("positions", *self.rows()))
         self.positions = tensors["positions"].to(self.positions).clone()
 
@@ -252,11 +244,7 @@ def occupied(cells: Tensor, by: Tensor) -> Tensor:
 
 
 def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
-    """Return anchor positions [A, 3] float32: the distinct grid vertices nearest to points [P, 3], world units.
-
-    Raises:
-        ValueError: no points, points that are not finite, or a voxel size that is not a positive length.
-    """
+    """Return anchor positions [A, 3] float32: the distinct grid vertices nearest to points [P, 3], world units."""
     if not (voxel_size > 0 and math.isfinite(voxel_size)):
         raise ValueError(f"voxel_size is {voxel_size}; it must be a length > 0 in world units, or auto")
     refuse_unusable(points, "anchors")

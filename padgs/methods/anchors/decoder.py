@@ -79,10 +79,7 @@ def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = 
     Other outputs are never used, so the result is exact. If most anchors have one, all are decoded, which is faster
     than filtering.
 
-    Args:
-        weights: the three networks.
-        inputs: [A, I], one row per anchor.
-        dtype: of the networks' products, see `padgs.methods.anchors.precision`.
+    `inputs` are [A, I]; `dtype` is that of the products, see `padgs.methods.anchors.precision`.
     """
     raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
     count, offsets = raw_opacities.shape
@@ -112,19 +109,11 @@ def decode_gaussians(
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """Return the selected Gaussians of all anchors (Eq. 13-15).
 
-    Differentiable by weights, features, offsets and log-scales.
-
-    Args:
-        weights: the three networks, of I inputs.
-        anchors: what is decoded.
-        precision: of the networks' products, a name of `padgs.methods.anchors.precision.PRECISIONS`; reduced ones are
-            made for GPUs and slower on the CPU.
+    Differentiable by weights, features, offsets and log-scales. `precision` is a name of
+    `padgs.methods.anchors.precision.PRECISIONS`; reduced ones are made for GPUs and slower on the CPU.
 
     Returns:
         N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient.
-
-    Raises:
-        ValueError: an unknown precision.
     """
     library = _library_for(anchors, precision)
     if library is None:
@@ -147,16 +136,10 @@ def decode_with_capacity(
 ) -> tuple[Gaussians, Tensor, Tensor, Tensor]:
     """Return `decode_gaussians` in a fixed number of rows, so that the host need not wait for N.
 
-    Args:
-        weights, anchors, precision: as for `decode_gaussians`.
-        capacity: rows, at most A K: the selected Gaussians up to the capacity, then zeros, which are culled.
+    `capacity` is the number of rows, at most A K: the selected Gaussians up to it, then zeros, which are culled.
 
     Returns:
         As `decode_gaussians`, with zeros at slots of Gaussians that are not selected; N, [1] int64.
-
-    Raises:
-        ValueError: tensors that are not float32 on a GPU, or an unknown precision.
-        OSError: the GPU's library was not built.
     """
     features = anchors.features
     if features.dtype != torch.float32 or features.device.type != cuda.device_type():

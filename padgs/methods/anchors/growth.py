@@ -117,9 +117,7 @@ class Growth:
         Args:
             raw_opacities: [A, K] as decoded.
             slots: [N] anchor K + k of each rendered Gaussian, distinct.
-            gradient: [N, 2] positional gradient, see `padgs.render.render`.
-            visible: [N] bool, of the rendering.
-            iteration: 1 for the first.
+            gradient, visible: [N, 2] positional gradient, [N] bool.
         """
         if not self.options.statistics_from < iteration < self.options.grow_until:
             return
@@ -132,11 +130,7 @@ class Growth:
 
     @torch.no_grad()
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Grow, then prune, if it is time to; return events.
-
-        Raises:
-            Failure: status collapsed; no anchor would be left.
-        """
+        """Grow, then prune, if it is time to; return events."""
         options = self.options
         if not options.grow_from < iteration < options.grow_until or iteration % options.grow_every:
             return ()
@@ -204,11 +198,7 @@ def find_new_anchors(
     Levels go from coarse to fine with growing thresholds; at each a candidate is kept with probability
     1 - 0.5^(level + 1). If the coarsest level finds none, finer ones are skipped.
 
-    Args:
-        model: A anchors with K Gaussians each.
-        mean_gradient: [A K] mean over views, negative for Gaussians that may not be candidates.
-        options: grids and thresholds.
-        generator: random choices, on the CPU.
+    `mean_gradient` [A K] is a mean over views, negative for Gaussians that may not be candidates.
     """
     centers, offsets = model.centers(), model.options.offsets
     anchors = cells_from_points(model.positions, model.voxel_size)  # [A, 3] in voxels

@@ -33,11 +33,8 @@ REDUCED_TYPES = {torch.bfloat16: 0, torch.float16: 1}  # as `ReducedType` of csr
 def decode_on_cpu(weights: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
     """Return means, quaternions, scales, opacities, colours, slots and raw opacities of the selected Gaussians.
 
-    Differentiable by weights, features, offsets and log-scales; the rest are constants.
-
-    Args:
-        weights: the twelve tensors of the networks in a row, float32.
-        tensors: the fields of `padgs.methods.anchors.decoder.SeenAnchors`.
+    `weights` are the twelve tensors of the networks, `tensors` the fields of `SeenAnchors`. Differentiable by weights,
+    features, offsets and log-scales.
     """
     return _DecodeOnCPU.apply(*tensors, *weights)
 
@@ -105,17 +102,10 @@ def decode_arguments(
 def decode_on_gpu(
     weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None, capacity: int | None = None
 ) -> tuple[Tensor, ...]:
-    """Decode on a GPU.
+    """Return `decode_on_cpu` and the number of selected Gaussians, [1] int64, with products in `dtype`.
 
-    Args:
-        weights, tensors: as for `decode_on_cpu`.
-        dtype: of the products; None: float32.
-        capacity: rows of the result, at most A K. The selected Gaussians come first, up to the capacity; rows behind
-            them are zeros with slots of Gaussians that are not selected. None: as many rows as are selected, a number
-            that the host waits for.
-
-    Returns:
-        As `decode_on_cpu`, and the number of selected Gaussians, [1] int64.
+    The result has `capacity` rows: the selected Gaussians up to it, then zeros with slots of Gaussians that are not
+    selected. None: as many rows as are selected, a number that the host waits for.
     """
     if dtype is not None:
         features, offsets, (hidden, inputs) = tensors[0], tensors[3], weights[0].shape

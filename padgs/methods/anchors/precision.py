@@ -19,23 +19,14 @@ GRADIENT_TYPE = torch.bfloat16
 
 
 def reduced_dtype(precision: str) -> torch.dtype | None:
-    """Return the type of a precision; None for float32, the tensors' own type.
-
-    Raises:
-        ValueError: an unknown precision; the message lists the known ones.
-    """
+    """Return the type of a precision; None for float32, the tensors' own type."""
     if precision not in PRECISIONS:
         raise ValueError(f"unknown precision {precision!r}; known: {', '.join(PRECISIONS)}")
     return None if precision == "float32" else getattr(torch, precision)
 
 
 def linear(inputs: Tensor, weight: Tensor, bias: Tensor, dtype: torch.dtype | None) -> Tensor:
-    """Apply a layer of weight [O, I] and bias [O] to inputs [A, I]; differentiable by all three.
-
-    Args:
-        inputs, weight, bias: of one type, which is also the type of the result.
-        dtype: of the product; None: the type of the inputs.
-    """
+    """Apply a layer of weight [O, I] and bias [O] to inputs [A, I] with a product in `dtype`, None: their type."""
     if dtype is None:
         return torch.addmm(bias, inputs, weight.T)
     return _ReducedLinear.apply(inputs, weight, bias, dtype)

@@ -85,12 +85,9 @@ class EgoNeRF(nn.Module):
         return model.to(scene.points.device)
 
     def trace(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None = None) -> RayColors:
-        """Render rays, differentiably by the parameters.
+        """Render rays from origins [B, 3], model units, along unit directions [B, 3]; differentiable by the parameters.
 
-        Args:
-            origins: [B, 3] model units.
-            directions: [B, 3] unit.
-            generator: jitters the samples in training; None: no jitter.
+        `generator` jitters the samples in training.
         """
         distances = self._sample(origins, directions, generator)
         at = self._at(origins, directions, distances)
@@ -175,13 +172,7 @@ class Shader(nn.Module):
         )
 
     def forward(self, products: Sequence[Tensor], chart: Tensor, directions: Tensor) -> Tensor:
-        """Return colours [N, 3].
-
-        Args:
-            products: [C, N] of each mode, see `grids.products`.
-            chart: [N] of the positions.
-            directions: [N, 3] unit, of the rays.
-        """
+        """Return colours [N, 3] from `grids.products`, charts [N] of the positions, and unit directions [N, 3]."""
         stacked = torch.cat(list(products))
         features = torch.where(chart == YANG, self.basis[YANG] @ stacked, self.basis[YIN] @ stacked).T
         seen = encoding(directions, self.options.direction_frequencies)

@@ -79,9 +79,6 @@ def exponential_nodes(first: float, last: float, count: int) -> Tensor:
     Intervals of the geometric series shorter than `first` become `first`, and all nodes behind them shift outwards (the
     published interval threshold); so the nodes end at or behind `last`.
 
-    Raises:
-        ValueError: too few nodes, or lengths that do not grow.
-
     >>> exponential_nodes(1.0, 4.0, 4).tolist()
     [0.0, 1.0, 2.0, 4.0]
     """
@@ -96,12 +93,7 @@ def exponential_nodes(first: float, last: float, count: int) -> Tensor:
 
 
 def node_fraction(radius: Tensor, nodes: Tensor) -> Tensor:
-    """Return the position of radii [...] among increasing nodes [N], piecewise linear, 0 at the first, 1 at the last.
-
-    Args:
-        radius: any shape.
-        nodes: [N] of the same dtype.
-    """
+    """Return the piecewise linear position of radii [...] among increasing nodes [N], from 0 to 1."""
     last = len(nodes) - 1
     upper = torch.searchsorted(nodes, radius.contiguous(), right=True).clamp(1, last)
     below, above = nodes[upper - 1], nodes[upper]

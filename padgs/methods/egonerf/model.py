@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, ClassVar, cast
 
@@ -11,7 +10,6 @@ from torch import Tensor
 
 from padgs.clock import Lap
 from padgs.methods.egonerf.field import EgoNeRF
-from padgs.methods.egonerf.options import EgoNeRFTraining
 from padgs.methods.egonerf.rays import RayPixels
 from padgs.render import Rendering
 from padgs.scene import Scene, View
@@ -26,20 +24,9 @@ VARIATION_FACTOR = 1e-2  # published, on both weights of the total variation
 class EgoNeRFModel:
     """An EgoNeRF with the schedule of a run; trained by `RayTrainer`."""
 
-    def __init__(self, field: EgoNeRF, options: EgoNeRFTraining, iterations: int) -> None:
-        """Wrap a radiance field for a run of `iterations`.
-
-        Raises:
-            ValueError: pretraining leaves no iteration for the grids, or there is no environment map.
-        """
-        self.field, self._options, self._iterations = field, options, iterations
-        options.refuse_length(iterations)
-        alone = options.environment_pretraining
-        if alone and field.environment is None:
-            raise ValueError(
-                f"environment_pretraining is {alone}, but {field.kind}s there is no environment; set "
-                "environment_pretraining=0, environment=true or surroundings=outdoor"
-            )
+    def __init__(self, field: EgoNeRF, iterations: int) -> None:
+        """Wrap a radiance field for a run of `iterations`."""
+        self.field, self._options, self._iterations = field, field.options, iterations
 
     @property
     def rays_at_once(self) -> int:
@@ -55,25 +42,17 @@ class EgoNeRFModel:
             ParameterGroup("shader", tuple(field.shader.parameters()), self._decaying(options.network_rate)),
         ]
         if field.environment is not None:
-            together = self._decaying(options.environment_rate)
-
-            def rate(iteration: int) -> float:
-                return options.pretraining_rate if self._pretrains(iteration) else together(iteration)
-
+            rate = self._decaying(options.environment_rate)
             groups.append(ParameterGroup("environment", tuple(field.environment.parameters()), rate))
         return groups
 
-    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
-        """Return colours [B, 3] of rays in the world with jittered samples; in pretraining, of the environment map."""
-        if self.field.environment is not None and self._pretrains(iteration):
-            return self.field.environment(directions)
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
+        """Return colours [B, 3] of rays in the world with jittered samples."""
         return self.field.trace(self.field.from_world(origins), directions, generator).color
 
     def regularisation(self, iteration: int) -> Tensor | None:
         """Return the weighted total variation of the planes; its weight decays like the learning rates."""
         options = self._options
-        if self._pretrains(iteration):
-            return None
         if options.density_variation == 0 and options.appearance_variation == 0:
             return None
         weighted = (
@@ -113,14 +92,9 @@ class EgoNeRFModel:
         """Load the parameters; there is no further state."""
         self.field.load_state_dict(state.tensors)
 
-    def _pretrains(self, iteration: int) -> bool:
-        return 0 < iteration <= self._options.environment_pretraining
-
-    def _decaying(self, rate: float) -> Callable[[int], float]:
-        """Return a schedule: 0 in pretraining, then exponential decay from `rate`."""
-        alone = self._options.environment_pretraining
-        decay = LogLinear(rate, rate * self._options.rate_decay, self._iterations - alone)
-        return lambda iteration: 0.0 if self._pretrains(iteration) else decay(iteration - alone)
+    def _decaying(self, rate: float) -> LogLinear:
+        """Return an exponential decay from `rate` over the run."""
+        return LogLinear(rate, rate * self._options.rate_decay, self._iterations)
 
 
 class RayTrainer(Trainer):
@@ -139,11 +113,7 @@ class RayTrainer(Trainer):
         rays: int,
         stage: Stage = nullcontext,
     ) -> None:
-        """Load all pixels; `rays` is the number per iteration, other arguments are as for `Trainer`.
-
-        Raises:
-            ValueError: the pixels of a view cannot be used.
-        """
+        """Load all pixels; `rays` is the number per iteration, other arguments are as for `Trainer`."""
         # The model has only those members of `Model` that do not depend on views.
         super().__init__(cast(Model, model), scene, budget, options, seed, stage=stage)
         self._model, self._rays = model, rays
@@ -160,7 +130,7 @@ class RayTrainer(Trainer):
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(model.rays_at_once):
             with self._stage("draw"):
-                image = model.colors(rays.origins[part], rays.directions[part], generator, step)
+                image = model.colors(rays.origins[part], rays.directions[part], generator)
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()

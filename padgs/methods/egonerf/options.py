@@ -35,7 +35,10 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class EgoNeRFOptions:
-    """The model. Lengths are in `length_unit`; None: the published value for the surroundings."""
+    """The model, and its training as published for Ricoh360.
+
+    Lengths are in `length_unit`; None: the published value for the surroundings.
+    """
 
     radial_nodes: int = 150  # of each chart
     polar_nodes: int = 172  # of each chart
@@ -59,12 +62,19 @@ class EgoNeRFOptions:
     environment: bool | None = None  # environment map as background; else black
     environment_height: int = 1920  # rows of the environment map; twice as many columns
     samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
+    rays: int = 4096  # of an iteration
+    grid_rate: float = 0.02  # learning rates of Adam at the start
+    network_rate: float = 1e-3  # bases and network
+    environment_rate: float = 5e-3  # of the environment map
+    rate_decay: float = 0.1  # rates and weights of the total variation decay exponentially to this share
+    density_variation: float = 0.1  # weight of the total variation of the density planes; 0: none
+    appearance_variation: float = 0.01  # weight of the total variation of the appearance planes
 
     def __post_init__(self) -> None:
         check_known(self, length_unit=LENGTH_UNITS, surroundings=("auto", *PUBLISHED))
         nodes = ("radial_nodes", "polar_nodes", "azimuth_nodes")
         check(self, "even, for the coarse grid halves it, and at least 4", lambda n: n >= 4 and n % 2 == 0, *nodes)
-        sizes = ("density_components", "appearance_components", "features", "hidden", "environment_height")
+        sizes = ("density_components", "appearance_components", "features", "hidden", "environment_height", "rays")
         check(self, "at least 1", lambda size: size >= 1, *sizes)
         check(self, "at least 0", lambda count: count >= 0, "feature_frequencies", "direction_frequencies")
         if self.coarse_samples < 4 or self.fine_samples < 1:
@@ -72,6 +82,9 @@ class EgoNeRFOptions:
                 f"coarse_samples is {self.coarse_samples} and fine_samples {self.fine_samples}; "
                 "they must be at least 4 and 1"
             )
+        rates = ("grid_rate", "network_rate", "environment_rate", "rate_decay")
+        check(self, "> 0", lambda rate: rate > 0, *rates)
+        check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
         for surroundings in PUBLISHED if self.surroundings == "auto" else (self.surroundings,):
             _check_constants(self.constants(surroundings))
         check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
@@ -107,33 +120,3 @@ def _check_constants(constants: Constants) -> None:
             "far - near larger than first_radius"
         )
     check(constants, "> 0", lambda scale: scale > 0, "distance_scale")
-
-
-@dataclass(frozen=True)
-class EgoNeRFTraining:
-    """The training, as published for Ricoh360."""
-
-    rays: int = 4096  # of an iteration
-    grid_rate: float = 0.02  # learning rates of Adam at the start
-    network_rate: float = 1e-3  # bases and network
-    environment_rate: float = 5e-3  # of the environment map
-    environment_pretraining: int = 0  # first iterations that train it alone; outdoor OmniBlender: 10 000
-    pretraining_rate: float = 0.02  # of the environment map in pretraining; rates decay after pretraining
-    rate_decay: float = 0.1  # rates and weights of the total variation decay exponentially to this share
-    density_variation: float = 0.1  # weight of the total variation of the density planes; 0: none
-    appearance_variation: float = 0.01  # weight of the total variation of the appearance planes
-
-    def __post_init__(self) -> None:
-        check(self, "at least 1", lambda count: count >= 1, "rays")
-        check(self, "at least 0", lambda count: count >= 0, "environment_pretraining")
-        rates = ("grid_rate", "network_rate", "environment_rate", "pretraining_rate", "rate_decay")
-        check(self, "> 0", lambda rate: rate > 0, *rates)
-        check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
-
-    def refuse_length(self, iterations: int) -> None:
-        """Raise ValueError if pretraining leaves no iteration for the grids."""
-        if self.environment_pretraining >= iterations:
-            raise ValueError(
-                f"environment_pretraining is {self.environment_pretraining} of {iterations} iterations, which leaves "
-                "none for the grids; train longer, or lower it"
-            )

@@ -36,11 +36,7 @@ class RayPixels:
     def __init__(
         self, views: Sequence[View], weight: str = "uniform", device: torch.device | str = "cpu", seed: int = 0
     ) -> None:
-        """Load every view once; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`.
-
-        Raises:
-            ValueError: a view has no pixels, or they have another size than the view, or its mask leaves none.
-        """
+        """Load every view once; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         colors, places, weights = [], [], []
         tables: dict[Camera, tuple[int, Tensor]] = {}  # start among all directions, directions
         starts, total = [], 0
@@ -84,11 +80,7 @@ class RayPixels:
         return State({"random/rays": self.generator.get_state()}, {"pixels": len(self)})
 
     def load(self, state: State) -> None:
-        """Restore it from the state of a trainer.
-
-        Raises:
-            ValueError: the state is of a run on other pixels.
-        """
+        """Restore it from the state of a trainer."""
         if state.values["pixels"] != len(self):
             raise ValueError(
                 f"the state is of a run on {state.values['pixels']} pixels, but the training views have {len(self)}; "

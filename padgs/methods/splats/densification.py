@@ -97,15 +97,12 @@ class Densifier:
         rendered_opacities: Callable[[], Tensor] | None = None,
         seed: int = 0,
     ) -> None:
-        """Start with empty statistics.
+        """Start with empty statistics; `options` have iterations of the run, see `DensificationOptions.for_run`.
 
         Args:
-            splats: the model.
-            options: with iterations of the run, see `DensificationOptions.for_run`.
             extent: length that sizes are compared with, world units.
             target: number of Gaussians to reach by the last round, in equal steps; None: as many as thresholds give.
             rendered_opacities: returns opacities [N] in [0, 1] after filters, at most the stored ones.
-            seed: of the generator.
         """
         self._rendered_opacities = rendered_opacities or (lambda: torch.sigmoid(splats.opacity_logits))
         self.splats, self.options, self.extent = splats, options, extent
@@ -114,13 +111,7 @@ class Densifier:
         self.statistics = self._empty()
 
     def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
-        """Add one view to the statistics.
-
-        Args:
-            gradient: [N, 2], [N, 3] or [N, 4] positional gradient.
-            visible: [N] bool.
-            iteration: of the view.
-        """
+        """Add one view to the statistics: positional gradient [N, 2], [N, 3] or [N, 4], and visible [N] bool."""
         if iteration < self.options.densify_until:
             if self.options.positional_gradient == "space_absolute":
                 gradient, absolute = gradient[:, :3], gradient[:, 3]

@@ -31,11 +31,7 @@ class Importance:
 
 @torch.no_grad()
 def importance_scores(model: Prunable, views: Sequence[View]) -> Importance:
-    """Score all rows; pixels of panoramas count by solid angle, those of other views equally.
-
-    Raises:
-        ValueError: no views, a view without an image, or a model that is not rendered from its Gaussians alone.
-    """
+    """Score all rows; pixels of panoramas count by solid angle, those of other views equally."""
     if not views:
         raise ValueError("no views to score by; give at least one")
     rows, change, contributes = next(iter(model.counts().values())), None, None
@@ -90,11 +86,9 @@ class PruningStep:
         requested: int | str | None,
         prune_psnr: float | None,
     ) -> None:
-        """Plan the step for a run of `iterations`.
+        """Plan the step for a run of `iterations`, whose `options` are from `DensificationOptions.for_run`.
 
         Args:
-            options: of the run, see `DensificationOptions.for_run`.
-            iterations: of the run.
             requested: `budget.gaussians`: the number that stays; auto or None: as many as `count_for_psnr` says.
             prune_psnr: dB for `count_for_psnr`; None: nothing is pruned.
         """

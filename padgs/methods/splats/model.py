@@ -52,19 +52,10 @@ class SplatModel:
         prune_psnr: float | None = None,
         smoothing_filter: float = 0.0,
     ) -> None:
-        """Wrap splats.
+        """Wrap splats for a run of `iterations`, with training `views` unless they are only rendered.
 
-        Args:
-            splats: the parameters.
-            options: of a published run, see `DensificationOptions.for_run`.
-            config: how the model is rendered.
-            extent: of the scene, world units.
-            iterations: of the run.
-            views: training views; empty for a model that is only rendered.
-            target: as in `Densifier`.
-            seed: of all random choices.
-            requested, prune_psnr: as in `PruningStep`.
-            smoothing_filter: variance of `SmoothingFilter`, square pixels; 0: none.
+        `options` are those of a published run; `extent` is in world units; `target` as in `Densifier`; `requested` and
+        `prune_psnr` as in `PruningStep`; `smoothing_filter` is the variance of `SmoothingFilter`, 0 for none.
         """
         self.splats, self.options, self.iterations = splats, options, iterations
         self._config, self._views, self._extent = config, views, extent
@@ -235,11 +226,7 @@ class SplatModel:
         return State(tensors, values)
 
     def load_state(self, state: State) -> None:
-        """Restore the model that `state` was taken of.
-
-        Raises:
-            ValueError: the state is of a model with other options.
-        """
+        """Restore the model that `state` was taken of."""
         self.load_model(state)
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
@@ -249,11 +236,7 @@ class SplatModel:
             self._filter.variances = state.tensors[FILTER_VARIANCES].to(device, copy=True)
 
     def load_model(self, state: State) -> None:
-        """Load the parameters only; densification starts anew.
-
-        Raises:
-            ValueError: the state is of a model with other options.
-        """
+        """Load the parameters only; densification starts anew."""
         self.splats.load(state.under("splats/"))
         self.splats.active_degree = state.values["active_degree"]
         self.splats.scene_scale = state.values["scene_scale"]

@@ -70,15 +70,7 @@ def call_cuda(sizes: tuple, center: Tensor, tiny: float, *tensors: Tensor | None
 def native_splats(parameters: Parameters, degree: int, center: Tensor, tiny: float, call: Call = call_cpu) -> Evaluated:
     """Evaluate Gaussians for a camera, differentiably by all parameters and by the offsets.
 
-    Args:
-        parameters: N Gaussians.
-        degree: spherical-harmonics degree in use.
-        center: [3] camera centre, world.
-        tiny: length added to distances, in squares; world units.
-        call: from `native_call`.
-
-    Raises:
-        ValueError: shapes, dtypes or devices that the library would misread.
+    `degree` is the SH degree in use, `center` [3] that of the camera, `tiny` a length added to distances, in squares.
     """
     return Evaluated(*_Splats.apply(call, degree, center.contiguous(), tiny, *parameters))
 

@@ -45,11 +45,7 @@ class Splats(nn.Module):
         scene_scale: float = 1.0,
         opacity: float = INITIAL_OPACITY,
     ) -> None:
-        """Build Gaussians without rotation and of one opacity: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3].
-
-        Raises:
-            ValueError: the degree is not 0, 1, 2 or 3.
-        """
+        """Build Gaussians without rotation: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3], one opacity."""
         super().__init__()
         if not 0 <= degree <= harmonics.MAX_DEGREE:
             raise ValueError(f"sh_degree is {degree}; it must be 0 to {harmonics.MAX_DEGREE}")
@@ -75,16 +71,7 @@ class Splats(nn.Module):
     ) -> Splats:
         """Return one Gaussian per point of the cloud; a random subset if there are more than `max_gaussians` points.
 
-        Args:
-            scene: with its point cloud and scale.
-            degree: of the spherical harmonics.
-            max_gaussians: None: no limit.
-            opacity: initial opacity.
-            scale: factor on `initial_scales`.
-            generator: chooses the subset, on the CPU.
-
-        Raises:
-            ValueError: the point cloud is empty or not finite.
+        `scale` is a factor on `initial_scales`; `generator` is on the CPU.
         """
         points, colors = scene.points.float(), scene.point_colors.float() / 255
         refuse_unusable(points, "Gaussians")
@@ -102,11 +89,7 @@ class Splats(nn.Module):
         return dict(self.named_parameters())
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Copy the `state_dict` of another model, whose number of Gaussians may differ.
-
-        Raises:
-            ValueError: as `padgs.training.optimizer.load_rows`.
-        """
+        """Copy the `state_dict` of another model, whose number of Gaussians may differ."""
         load_rows(self, tensors, self.rows())
 
     def gaussians(self, view: View) -> Gaussians:

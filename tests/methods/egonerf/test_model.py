@@ -27,7 +27,7 @@ class Flat:
     def groups(self) -> list[ParameterGroup]:
         return [ParameterGroup("color", (self.color,), Constant(1e-2))]
 
-    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
         self.passes.append(len(origins))
         return self.color.expand(len(origins), 3)
 
