@@ -1,8 +1,8 @@
 """The photometric loss (Eq. 16) and the SSIM map it is made of.
 
 loss = lambda <|image - target|> + (1 - lambda) <1 - SSIM>, where <.> is the mean over pixels and channels weighted by
-W = row weight M (Eq. 17) x mask. Ignored pixels have weight 0; images are never filled with zeros, which would count as
-perfect agreement.
+W = row weight M (Eq. 17) x mask. Pixels that a mask hides have weight 0. SSIM windows that reach them see the target in
+both images, so that no gradient comes from hidden pixels.
 """
 
 from __future__ import annotations
@@ -54,6 +54,10 @@ def photometric_loss(
     if normalisation not in NORMALISATIONS:
         raise ValueError(f"unknown normalisation {normalisation!r}; known: {', '.join(NORMALISATIONS)}")
     height, width, channels = image.shape
+    if weight.shape == (height, width):  # with a mask
+        visible, filling = weight[..., None] > 0, target.detach()
+        image = torch.where(visible, image, filling)
+        target = torch.where(visible, target, filling) if target.requires_grad else target
     total = weight.sum() * (height * width // weight.numel() * (channels if normalisation == "mean" else 1))
     if fits(image):
         loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, total)

@@ -54,3 +54,22 @@ def test_what_is_not_alike_never_reaches_the_library():
             loss.fused_photometric_loss(image, wrong, weight, 0.8, torch.tensor(1.0))
     with pytest.raises(ValueError, match="image, target, weight and total are on cpu, meta; bring them to one device"):
         loss.fused_photometric_loss(image, target, weight.to("meta"), 0.8, torch.tensor(1.0))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # the native loss takes float32 only
+def test_hidden_pixels_have_no_part_in_the_loss(dtype):
+    """SSIM windows within five pixels of a mask reach behind it."""
+    image, target, generator = pair(24, 48)
+    mask = (torch.rand(24, 48, generator=generator) > 0.3).float()
+    mask[18:] = 0
+    mask[3, 5] = 0.5
+    weight = pixel_weight("solid_angle", 24, mask).to(dtype)
+    image, target, hidden = image.to(dtype), target.to(dtype), mask == 0
+    changed = torch.where(hidden[..., None], torch.rand(24, 48, 3, generator=generator).to(dtype), image)
+    values, gradients = [], []
+    for made in (image, changed):
+        leaves = made.clone().requires_grad_(), target.clone().requires_grad_()
+        values.append(photometric_loss(*leaves, weight, 0.2))
+        gradients.append(torch.autograd.grad(values[-1], leaves))
+    assert values[0] == values[1] and all(map(torch.equal, *gradients))
+    assert all((gradient[hidden] == 0).all() and (gradient[~hidden] != 0).all() for gradient in gradients[0])
