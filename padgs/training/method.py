@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from padgs.clock import Lap
 from padgs.geometry.camera import Panorama, RayTable
 from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
@@ -24,7 +25,7 @@ from padgs.training.health import held_out, is_out_of_memory
 from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer
 from padgs.training.model import Model, Prunable, Record, Refined, Size, State
-from padgs.training.options import Budget, TrainOptions
+from padgs.training.options import CLOCKS, Budget, TrainOptions
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 REHEARSED = 0.02  # share of a budget of seconds that measures the speed of a method
@@ -74,7 +75,8 @@ class Method(ABC):
         """Train from the scene's point cloud, a warm start or a loaded state; yield a record per iteration.
 
         The caller may stop between two records and call `state()` then. With a budget of seconds, a few steps are
-        taken first and thrown away; they count as training time and fix the length of the schedule.
+        taken first and thrown away; they fix the length of the schedule. They and building the initial model count as
+        training time.
 
         Args:
             scene: needs at least one training view.
@@ -85,19 +87,16 @@ class Method(ABC):
             ValueError: at once: the method cannot train on this scene or within this budget.
             Failure: during training: the run ends with a status other than ok.
         """
+        lap = Lap()
         if not scene.train:
             raise ValueError(f"scene {scene.name!r} has no training view; correct its split")
         self.refuse_budget(budget)
         if self.train_options.refine and self._warm_start_state is None and self._loaded_state is None:
             raise ValueError("train.refine refines the model of a finished run; set init=RUN, or train.refine=false")
         self._gaussians = budget.gaussians
-        spent = (0.0, 0.0)
         if budget.seconds is not None:
-            if self._loaded_state is None:
-                length, spent = self._measure_speed(scene, budget)
-            else:
-                length = self._loaded_state.values["schedule"]
-            budget = replace(budget, iterations=length)
+            known = None if self._loaded_state is None else self._loaded_state.values["schedule"]
+            budget = replace(budget, iterations=known or self._schedule_length(scene, budget, lap))
         self._model = self._initial_model(scene, budget.iterations)
         if self.train_options.hold_out:
             scene = replace(scene, train=held_out(scene.train)[0])
@@ -106,8 +105,7 @@ class Method(ABC):
             self._trainer = Trainer(refined, scene, budget, self.train_options, self.seed, stage=stage)
         else:
             self._trainer = self.build_trainer(self._model, scene, budget, stage)
-        self._trainer.seconds += spent[0]
-        self._trainer.cpu_seconds += spent[1]
+        self._trainer.seconds, self._trainer.cpu_seconds = lap.seconds()
         if self._warm_start_state is not None:
             stored, own = self._warm_start_state.under(VIEWS), self._trainer.corrections.state_dict()
             if all(tensor.shape == stored[name].shape for name, tensor in own.items() if name in stored):
@@ -247,10 +245,10 @@ class Method(ABC):
             model.prune(self._gaussians, scene.train)
         return model
 
-    def _measure_speed(self, scene: Scene, budget: Budget) -> tuple[int, tuple[float, float]]:
-        """Return the schedule length for a budget of seconds, and the (wall, CPU) seconds that measuring it took.
+    def _schedule_length(self, scene: Scene, budget: Budget, lap: Lap) -> int:
+        """Return the schedule length for a budget of seconds since the start of `lap`, by some steps on one view.
 
-        All steps are on one view, so that all but the first find its image decoded.
+        All but the first find its image decoded.
         """
         assert budget.seconds is not None
         random, first = torch.get_rng_state(), 0.0
@@ -264,5 +262,5 @@ class Method(ABC):
                 break
         torch.set_rng_state(random)
         each = (trainer.spent - first) / (trainer.iteration - 1)
-        length = max(2, round(SLOWER * (budget.seconds - trainer.spent) / each))
-        return length, (trainer.seconds, trainer.cpu_seconds)
+        left = budget.seconds - lap.seconds()[CLOCKS.index(budget.clock)]
+        return max(2, round(SLOWER * left / each))

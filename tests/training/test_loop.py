@@ -1,4 +1,5 @@
 import math
+import time
 from collections import Counter
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from padgs import clock
 from padgs.gaussians import Gaussians
+from padgs.methods.splats.method import SplatMethod
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.training import schedule as schedules
@@ -324,6 +326,17 @@ def test_time_spent_by_the_caller_does_not_count(monkeypatch):
     clock.now += 1.0  # evaluation, files, ...
     second = next(records)
     assert (second.seconds, second.cpu_seconds) == (2 * TICK, 2 * TICK)
+
+
+@pytest.mark.parametrize("seconds", [None, 0.5])
+def test_building_the_start_is_training_time(seconds):
+    class Slow(SplatMethod):
+        def build_model(self, scene, iterations):
+            time.sleep(0.1)
+            return super().build_model(scene, iterations)
+
+    first = next(Slow().fit(tiny_scene(), Budget(2, seconds=seconds)))
+    assert first.seconds > (0.1 if seconds is None else 0.2)  # a start for the rehearsal, and one for the run
 
 
 @pytest.mark.parametrize("clock", ["wall", "cpu"])

@@ -8,7 +8,6 @@ from typing import Any, ClassVar, cast
 import torch
 from torch import Tensor
 
-from padgs.clock import Lap
 from padgs.methods.egonerf.field import EgoNeRF
 from padgs.methods.egonerf.rays import RayPixels
 from padgs.render import Rendering
@@ -117,10 +116,8 @@ class RayTrainer(Trainer):
         # The model has only those members of `Model` that do not depend on views.
         super().__init__(cast(Model, model), scene, budget, options, seed, stage=stage)
         self._model, self._rays = model, rays
-        lap = Lap()
         self._pixels = RayPixels(scene.train, options.weight, self._optimizer.device, seed)
         self._order = self._pixels
-        self.seconds, self.cpu_seconds = lap.seconds()  # reading images counts as training
 
     def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int]]:
         model, generator = self._model, self._pixels.generator

@@ -1,6 +1,5 @@
 """Training on random rays."""
 
-import time
 from dataclasses import replace
 
 import pytest
@@ -58,19 +57,6 @@ def test_the_mean_colour_is_learned():
     mean = torch.stack([view.image() for view in tiny_scene().train]).mean((0, 1, 2))
     assert torch.allclose(model.color.detach(), mean, atol=0.03)
     assert records[-1].loss < records[0].loss and records[0].counts == {"colors": 1, "rays": 200}
-
-
-def test_reading_the_images_is_training_time():
-    views = tiny_scene().train
-
-    def slow():
-        time.sleep(0.05)
-        return (views[0].image() * 255).round().to(torch.uint8)
-
-    first = replace(views[0], load_pixels=slow)
-    run = trainer(Flat(), 10, scene=replace(tiny_scene(), train=(first, *views[1:])))
-    reading = run.seconds
-    assert reading >= 0.05 and next(run.records()).seconds > reading
 
 
 def test_loss_is_the_weighted_squared_error():
