@@ -129,6 +129,8 @@ def _name(kind: Any) -> str:
     names = {type(None): "null", bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
     if is_dataclass(kind) or get_origin(kind) is Mapping:
         return "a group of keys"
+    if get_origin(kind) is tuple:
+        return "a list" if Ellipsis in get_args(kind) else f"a list of {len(get_args(kind))} values"
     return names.get(kind) or getattr(kind, "__name__", str(kind))
 
 

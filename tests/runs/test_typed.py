@@ -59,6 +59,8 @@ def test_null_where_it_is_allowed():
         ({"steps": 1, "wrap": None}, "a.wrap is None"),
         ({"steps": 1, "limit": "x"}, "a.limit is 'x'; it must be a number or null"),
         ({"steps": 1, "inner": 3}, "a.inner is 3; it must be a group of keys"),
+        ({"steps": 1, "inner": {"pair": "x"}}, "a.inner.pair is 'x'; it must be a list of 2 values"),
+        ({"steps": 1, "inner": {"names": 1}}, "a.inner.names is 1; it must be a list"),
         ({"steps": 1, "inner": {"pair": [1]}}, r"a.inner.pair is \[1\]; it must have 2 entries"),
         ({"steps": 1, "inner": {"tau": 2}}, "a.inner: tau is 2.0; it must be at most 1"),
     ],
