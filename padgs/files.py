@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -17,6 +18,14 @@ if TYPE_CHECKING:
 
 # Other decoders of Pillow run programs on what a file holds, such as Ghostscript, whatever the name of the file.
 IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+# First bytes of formats that Pillow does not know.
+_OTHER_FORMATS = {
+    b"ftyp": "HEIC, AVIF or a video",
+    b"%PDF": "PDF",
+    b"\0\0\0\x0cJXL": "JPEG XL",
+    b"<": "HTML, XML or SVG",
+}
+MAX_PIXELS = 180_000_000  # a panorama of 18972x9486
 
 DRAFT = ".padgs-draft-"  # begins the names of files and folders that are not complete
 DAY = 86400.0  # seconds
@@ -85,13 +94,64 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.close(folder)
 
 
-def open_image(file: Path | IO[bytes]) -> Image:
+class ImageError(OSError):
+    """An image that is not read. The message names the file, the rule and the way out."""
+
+
+def open_image(file: Path | IO[bytes], name: object = None) -> Image:
     """Open an image of `IMAGE_FORMATS`, which `with` closes; pixels are decoded when they are needed.
 
     Raises:
-        OSError: it cannot be read, or has another format (PIL.UnidentifiedImageError).
-        PIL.Image.DecompressionBombError: it has more pixels than Pillow reads.
+        ImageError: it has another format, is damaged, or has more than `MAX_PIXELS` pixels.
+        OSError: it cannot be read.
     """
+    from PIL import Image, UnidentifiedImageError
+
+    name = file if name is None else name
+    if isinstance(file, Path) and file.exists() and not file.is_file():
+        raise ImageError(f"{name} is not a regular file; replace or remove it")
+    Image.MAX_IMAGE_PIXELS = None  # the size is checked below, with a remedy
+    try:
+        image = Image.open(file, formats=IMAGE_FORMATS)
+    except (OSError, SyntaxError, ValueError, TypeError, OverflowError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        found = _format_of(file)
+        why = "" if isinstance(error, UnidentifiedImageError) else f": {error}"
+        if found in IMAGE_FORMATS:
+            raise ImageError(
+                f"{name} is a {found} file of a kind that is not read, or is damaged{why}; convert it to 8 bits per "
+                "channel, replace or remove it"
+            ) from error
+        raise ImageError(
+            f"{name} is not an image in {', '.join(IMAGE_FORMATS)} (it is {found}{why}); convert, replace or remove it"
+        ) from error
+    if image.width * image.height > MAX_PIXELS:
+        image.close()
+        width = 2 * math.isqrt(MAX_PIXELS // 2)
+        raise ImageError(
+            f"{name} is too large: it has {image.width * image.height / 1e6:.0f} million pixels "
+            f"({image.width}x{image.height}), and at most {MAX_PIXELS / 1e6:.0f} million are read; reduce it to "
+            f"{width}x{width // 2} or less (`mogrify -resize {width}x FILE`)"
+        )
+    return image
+
+
+def _format_of(file: Path | IO[bytes]) -> str:
+    """Return the format of a file by its first bytes, without decoding it."""
     from PIL import Image
 
-    return Image.open(file, formats=IMAGE_FORMATS)
+    if isinstance(file, Path):
+        start = file.read_bytes()[:64]
+    else:
+        file.seek(0)
+        start = file.read(64)
+    Image.init()
+    for beginning, name in _OTHER_FORMATS.items():
+        if start.startswith(beginning, 4 if name.startswith("HEIC") else 0):
+            return name
+    for name, (_, accepts) in Image.OPEN.items():
+        with suppress(Exception):  # of plugins, at too few bytes
+            if accepts is not None and accepts(start[:16]):
+                return name
+    return "of an unknown format"

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
 from padgs.data.cloud import initial_cloud
-from padgs.data.images import EXTENSIONS, ImageFile, inspect
+from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
 from padgs.data.masks import find_masks
 from padgs.data.splits import split_frames
 from padgs.data.store import ImageStore, StoredImage
@@ -36,7 +36,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     refuse_clashes(names)
     _refuse_missing(capture)
     images = [inspect(frame.image) for frame in capture.frames]
-    notes = [*capture.notes, *_camera_notes(capture.frames, images)]
+    notes = [*capture.notes, *_camera_notes(capture.frames, images), *notes_on(images)]
     target = options.width
     if target is None and capture.width is not None and images[0].width > capture.width:
         target = capture.width

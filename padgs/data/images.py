@@ -1,12 +1,13 @@
 """Image files: checks, decoding and saving.
 
-A panorama is an 8-bit colour image, twice as wide as high, stored upright. Other files are refused when the scene is
-loaded, before any training.
+A panorama is an 8-bit colour image in sRGB, twice as wide as high, stored upright; a part of one that says so
+(`image_metadata.Crop`) is padded. Other files are refused when the scene is loaded, before any training.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -14,65 +15,108 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
-from padgs.data.capture import DataError
-from padgs.files import IMAGE_FORMATS, open_image
+from padgs.data.capture import DataError, listed
+from padgs.data.image_metadata import (
+    Crop,
+    crop_of,
+    load_late_chunks,
+    refuse_rotated,
+    refuse_several_pictures,
+    srgb_conversion,
+    tilt_of,
+)
+from padgs.files import ImageError, open_image
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-_ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
+_COLOUR = ("RGB", "RGBA", "RGBa", "RGBX", "P", "PA", "YCbCr")
 _GREY = ("1", "L", "LA", "La")
+_ALPHA = ("RGBA", "RGBa", "LA", "La", "PA")
 GREY = 128  # libjpeg fills missing rows with it
 FILLING = b"\x55" * 2048  # decodes to a few pixels of a JPEG scan
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """A checked image file: its size in pixels and the digest of its bytes."""
+    """A checked image file: size of its panorama in pixels, digest of its bytes, and its statements about itself."""
 
     path: Path
     width: int
     height: int
     digest: str
+    crop: Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
+    converted: bool = False  # whether other programs read other pixels, because the colours are not sRGB
+    tilt: str | None = None  # pitch and roll of the camera
 
 
 def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
     Raises:
-        DataError: missing, unreadable, not an image, truncated, rotated by EXIF, 16-bit, grey, CMYK, not 2:1, or partly
-            transparent.
+        DataError: missing, unreadable, not an image, truncated, rotated, of several pictures, 16-bit, grey, not 2:1,
+            partly transparent, or with colours that cannot be converted to sRGB.
     """
     data = read_bytes(path)
-    try:
-        with open_image(BytesIO(data)) as image:
-            width, height, mode, has_alpha = image.width, image.height, image.mode, "A" in image.getbands()
-            orientation = 1 if image.format == "PNG" and "exif" not in image.info else image.getexif().get(_ORIENTATION)
-            deep = _is_deep(image, data)
-    except Image.DecompressionBombError as error:
-        raise DataError(
-            f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, the most that are "
-            "read; reduce it (`mogrify -resize 50%`)"
-        ) from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        formats = ", ".join(IMAGE_FORMATS)
-        raise DataError(f"{path} is not an image in {formats} ({error}); convert, replace or remove it") from error
-    if orientation not in (None, 0, 1):
-        raise DataError(
-            f"{path} carries EXIF orientation {orientation}: its pixels are stored rotated, and it is unknown which "
-            "orientation the poses refer to; store it upright (`mogrify -auto-orient`) or remove the flag"
-        )
-    if deep and not mask:
-        raise DataError(f"{path} has 16 bits or more per channel ({mode}); convert it to 8 bits (`mogrify -depth 8`)")
-    if mode in _GREY and not mask:
-        raise DataError(f"{path} is grey ({mode}); panoramas must be colour, 3 x 8 bits: convert it or remove it")
-    if mode == "CMYK":
-        raise DataError(f"{path} is CMYK; convert it to RGB")
-    refuse_other_shapes(width, height, path)
-    if _looks_cut(data) or has_alpha:
+    with _opened(data, path) as image:
+        try:
+            load_late_chunks(image, data)
+            refuse_rotated(image, path)
+            refuse_several_pictures(image, path)
+            mode, conversion = image.mode, None
+            _refuse_other_modes(image, data, path, mask)
+            crop, tilt = crop_of(image, path), tilt_of(image)
+            if not mask:
+                conversion = srgb_conversion(image, data, path)
+        except (OSError, SyntaxError, ValueError, EOFError) as error:
+            if isinstance(error, DataError):
+                raise
+            raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+        size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
+        may_be_transparent = mode in _ALPHA or "transparency" in image.info
+    refuse_other_shapes(*size, path)
+    if _looks_cut(data) or may_be_transparent:
         _decode(data, path, "L" if mask else "RGB")
-    return ImageFile(path, width, height, hashlib.sha256(data).hexdigest())
+    digest = hashlib.sha256(data).hexdigest()
+    return ImageFile(path, *size, digest, crop, conversion is not None, tilt)
+
+
+def _opened(data: bytes, path: Path) -> Image.Image:
+    try:
+        return open_image(BytesIO(data), path)
+    except ImageError as error:
+        raise DataError(str(error)) from error
+
+
+def _refuse_other_modes(image: Image.Image, data: bytes, path: Path, mask: bool) -> None:
+    mode = image.mode
+    if mask:
+        if mode not in (*_COLOUR, *_GREY) and not mode.startswith("I;16") and (mode, image.format) != ("I", "PNG"):
+            raise DataError(f"{path} has pixels of type {mode}; save masks as grey images with 8 bits (0 to 255)")
+        return
+    if _is_deep(image, data):
+        raise DataError(f"{path} has 16 bits or more per channel ({mode}); convert it to 8 bits (`mogrify -depth 8`)")
+    if mode in _GREY:
+        raise DataError(f"{path} is grey ({mode}); panoramas must be colour, 3 x 8 bits: convert it or remove it")
+    if mode not in _COLOUR:
+        raise DataError(f"{path} is {mode}; convert it to RGB (`mogrify -colorspace sRGB`)")
+
+
+def notes_on(images: Sequence[ImageFile]) -> list[str]:
+    """Return what images say of themselves that is worth a note."""
+    notes = []
+    if cropped := [image for image in images if image.crop is not None]:
+        names = listed(image.path.name for image in cropped)
+        notes.append(f"images: parts of panoramas by their GPano data, the rest is masked: {names}")
+    if converted := [image for image in images if image.converted]:
+        notes.append(f"images: converted to sRGB: {listed(image.path.name for image in converted)}")
+    if tilted := [image for image in images if image.tilt is not None]:
+        notes.append(
+            f"images: {len(tilted)} say that the camera was tilted, such as {tilted[0].path.name} ({tilted[0].tilt} "
+            "degrees); poses must be those of the pixels as stored"
+        )
+    return notes
 
 
 def refuse_other_shapes(width: int, height: int, path: Path) -> None:
@@ -81,15 +125,19 @@ def refuse_other_shapes(width: int, height: int, path: Path) -> None:
     Raises:
         DataError: the size is not that of a full panorama.
     """
-    if width != 2 * height:
+    if width != 2 * height or not height:
+        eyes = {1: "one above the other", 4: "side by side"}.get(
+            width // height if height and width % height == 0 else 0
+        )
+        stereo = f"; if it holds two panoramas {eyes} (stereo), cut out one" if eyes else ""
         raise DataError(
             f"{path} is {width}x{height}, which is not 2:1; an equirectangular panorama covers 360 x 180 degrees "
-            "(a dual-fisheye or cropped image must be stitched or padded first)"
+            f"(a dual-fisheye or cropped image must be stitched or padded first{stereo})"
         )
 
 
 def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
-    """Decode an image file to uint8 pixels, [H, W, 3] for RGB and [H, W, 1] for L.
+    """Decode an image file to uint8 pixels, [H, W, 3] for RGB in sRGB, and [H, W, 1] for L.
 
     Raises:
         DataError: the file is truncated, damaged, or partly transparent.
@@ -105,19 +153,37 @@ def save_png(pixels: Tensor, path: Path) -> None:
 
 def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
     try:
-        with open_image(BytesIO(data)) as image:
+        with _opened(data, path) as image:
             image.load()
-            transparent = "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
-            pixels = np.array(_eight_bit(image).convert(mode))
-            cut = _misses_pixels(image, data, pixels)
+            transparent = _is_transparent(image)
+            convert = srgb_conversion(image, data, path) if mode == "RGB" else None
+            crop, stored = crop_of(image, path), _eight_bit(image).convert(mode)
+            cut = _misses_pixels(image, data, np.asarray(stored))
+            pixels = np.array(stored if convert is None else convert(stored))
     except (OSError, SyntaxError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
     if cut:
         raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
     if transparent:
         remedy = "say what to ignore in a mask file (data.mask)" if mode == "RGB" else "paint what to ignore black (0)"
         raise DataError(f"{path} has transparent pixels; save it without alpha, and {remedy}")
+    if crop is not None:
+        rows = (crop.top, crop.full_height - crop.top - crop.height)
+        columns = (crop.left, crop.full_width - crop.left - crop.width)
+        pixels = np.pad(pixels, (rows, columns, (0, 0))[: pixels.ndim])
     return pixels if mode == "RGB" else pixels[..., None]
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    """Return whether a pixel is not opaque, by an alpha channel, a palette with transparency, or a colour key."""
+    key = image.info.get("transparency")
+    if image.mode.startswith("I"):
+        return key is not None and bool((np.asarray(image) == key).any())
+    if image.mode not in _ALPHA and key is None:
+        return False
+    return np.asarray(image.convert("RGBA").getchannel("A")).min() < 255
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
@@ -133,6 +199,8 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         DataError: missing, unreadable or empty.
     """
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path} cannot be read: it is no regular file; replace or remove it")
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.capture import Capture, DataError
+from padgs.data.image_metadata import Crop
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
 from padgs.geometry.distortion import solid_angle_weight
@@ -29,16 +30,16 @@ class Mask:
     """Weights of one view; used as `View.load_mask`."""
 
     file: StoredImage | None
-    rows: Tensor | None  # [H, 1] float32
+    fixed: Tensor | None  # [H, W or 1] float32, of `rows:` and of crops
 
     def __call__(self) -> Tensor:
         """Return weights [H, W] float32 in [0, 1]."""
         weight = None if self.file is None else self.file()[..., 0].float() / 255
-        if self.rows is None:
+        if self.fixed is None:
             assert weight is not None
             return weight
-        rows = self.rows if weight is None else self.rows.to(weight.device)
-        return rows.expand(-1, 2 * len(rows)).clone() if weight is None else weight * rows
+        fixed = self.fixed if weight is None else self.fixed.to(weight.device)
+        return fixed.expand(-1, 2 * len(fixed)).clone() if weight is None else weight * fixed
 
 
 def row_weights(keep: float, of: float, height: int) -> Tensor:
@@ -50,6 +51,17 @@ def row_weights(keep: float, of: float, height: int) -> Tensor:
     959.0
     """
     return (keep / of * height - torch.arange(height, dtype=torch.float64)).clamp(0, 1).float()[:, None]
+
+
+def crop_weights(crop: Crop, width: int, height: int) -> Tensor:
+    """Return weights [height, width]: 1 where a pixel shows nothing but the crop, else 0."""
+
+    def inside(start: int, size: int, full: int, count: int) -> Tensor:
+        edges = torch.arange(count + 1, dtype=torch.float64) * full / count
+        return ((edges[:-1] > start - 1e-6) & (edges[1:] < start + size + 1e-6)).float()
+
+    rows = inside(crop.top, crop.height, crop.full_height, height)
+    return rows[:, None] * inside(crop.left, crop.width, crop.full_width, width)
 
 
 def find_masks(
@@ -69,10 +81,8 @@ def find_masks(
             `spec` is invalid.
     """
     spec = capture.mask if spec == "auto" else spec
-    if spec == "none":
-        return [None] * len(images), [], []
     rule = _ROWS.fullmatch(spec)
-    files, note = _mask_files(capture, mask_path(spec, capture.folder))
+    files, note = ({}, None) if spec == "none" else _mask_files(capture, mask_path(spec, capture.folder))
     notes = [note] if note else []
     rows: dict[int, Tensor] = {}  # by height
     if rule:
@@ -88,9 +98,12 @@ def find_masks(
     inspected: dict[Path, ImageFile] = {}
     checked: set[StoredImage | None] = set()
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
-        path = files.get(frame.name)
+        path, fixed = files.get(frame.name), rows.get(height)
+        if image.crop is not None:
+            fixed = crop_weights(image.crop, width, height) * (1 if fixed is None else fixed)
+            _refuse_hidden(fixed, f"the crop of {image.path} hides {{}}; remove that image")
         if path is None:
-            masks.append(Mask(None, rows[height]) if rule else None)
+            masks.append(None if fixed is None else Mask(None, fixed))
             continue
         if path not in inspected:
             inspected[path] = inspect(path, mask=True)
@@ -100,7 +113,7 @@ def find_masks(
                 f"{path} is {mask_file.width}x{mask_file.height} but {image.path.name} is "
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
-        mask = Mask(StoredImage(path, width, height, store, "L"), rows.get(height))
+        mask = Mask(StoredImage(path, width, height, store, "L"), fixed)
         if mask.file not in checked:
             _refuse_hidden(mask(), f"{path} hides {{}} of {frame.name}; in a mask 255 means use, 0 means ignore")
         checked.add(mask.file)

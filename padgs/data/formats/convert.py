@@ -14,9 +14,9 @@ from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
 from padgs.data.cloud import initial_cloud
 from padgs.data.formats.writers import WRITERS, Content
-from padgs.data.images import save_png
+from padgs.data.images import inspect, save_png
 from padgs.data.masks import write_masks
-from padgs.files import draft_of, open_image
+from padgs.files import draft_of
 from padgs.scene import Scene
 
 IMAGE_FOLDERS = {"ricoh360": "imgs"}  # default: images
@@ -90,9 +90,9 @@ def _write_images(
     for done, i in enumerate(kept):
         frame = capture.frames[i]
         view = views[view_name(frame.name)]
-        with open_image(frame.image) as image:
-            reduced = image.width != view.width
-        encode = reduced or (to in PNG_ONLY and frame.image.suffix.lower() != ".png")
+        image = inspect(frame.image)
+        changed = image.width != view.width or image.crop is not None or image.converted
+        encode = changed or (to in PNG_ONLY and frame.image.suffix.lower() != ".png")
         name = str(PurePosixPath(frame.name).with_suffix(".png")) if encode else frame.name
         if encode:
             assert view.load_pixels is not None

@@ -24,7 +24,7 @@ from padgs.data.camera_paths import gravity
 from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
-from padgs.data.images import decode
+from padgs.data.images import ImageFile, decode
 from padgs.data.masks import write_masks
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.sfm import image_pairs
@@ -124,7 +124,9 @@ class _Job:
         self.folder.open("images", of_images, keep=of_video)
         self.input = given or of_images
         # Short names, because pycolmap's list of pairs does not support spaces.
-        self.files = {f"{index:06d}{_suffix(name)}": name for index, name in enumerate(self.source.images)}
+        self.files = {
+            f"{index:06d}{_suffix(image)}": name for index, (name, image) in enumerate(self.source.images.items())
+        }
         self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
         self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
         self.database = self.work / "database.db"
@@ -148,7 +150,7 @@ class _Job:
         images, masks = self.folder.empty("images"), self.folder.empty("masks")
         for short, name in self.files.items():
             image, mask = self.source.images[name], self.source.masks.get(name)
-            if Path(short).suffix == image.path.suffix:
+            if not short.endswith(".panorama.png"):
                 link_or_copy(image.path, images / short)
             else:
                 Image.fromarray(decode(image.path)).save(images / short, compress_level=1)
@@ -278,10 +280,11 @@ class _Job:
         refuse_full(self.work)
 
 
-def _suffix(name: str) -> str:
-    """Return the suffix of an image for pycolmap."""
-    suffix = Path(name).suffix
-    return suffix if suffix.lower() in sfm.IMAGE_SUFFIXES else ".png"
+def _suffix(image: ImageFile) -> str:
+    """Return the suffix of an image for pycolmap; another one if it must be decoded for it."""
+    suffix = image.path.suffix
+    is_read = suffix.lower() in sfm.IMAGE_SUFFIXES and image.crop is None and not image.converted
+    return suffix if is_read else ".panorama.png"
 
 
 def _pycolmap_message(error: Exception, log: Path) -> str:

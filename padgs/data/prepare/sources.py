@@ -17,7 +17,15 @@ from PIL import Image
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, DataError, Frame, listed
 from padgs.data.check import OVERLAY
-from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye, refuse_other_shapes
+from padgs.data.images import (
+    EXTENSIONS,
+    ImageFile,
+    decode,
+    inspect,
+    notes_on,
+    refuse_dual_fisheye,
+    refuse_other_shapes,
+)
 from padgs.data.masks import PREVIEW, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
 
@@ -143,7 +151,8 @@ def find_source(path: Path, mask: str) -> Source:
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
     capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
-    masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
+    masks, digests, mask_notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
+    notes = [*notes_on(list(images.values())), *mask_notes]
     if others:
         notes.append(f"left out: {others}{ways_out}")
     expected = mask_folder(path)

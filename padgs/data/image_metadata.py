@@ -1,0 +1,197 @@
+"""Statements of an image file about its pixels: orientation, crop of a panorama, stereo, colours, pages.
+
+They are read and applied, or the file is refused with a remedy; none is ignored. Pixels of a mask are no colours.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from io import BytesIO
+from typing import cast
+
+import numpy as np
+from PIL import ExifTags, Image, ImageCms
+
+from padgs.data.capture import DataError
+
+_ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
+_SRGB_GAMMA = 0.45455  # of the gAMA chunk of a PNG
+_SRGB_CHROMATICITIES = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # white, red, green and blue of cHRM
+_CROP_PROPERTIES = (
+    *("FullPanoWidthPixels", "FullPanoHeightPixels", "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels"),
+    *("CroppedAreaLeftPixels", "CroppedAreaTopPixels"),
+)
+_WIDEST = 100_000  # pixels
+_SAME_COLOUR = 3  # of 255: profiles of sRGB differ in rounding
+_REMOVE = "remove the metadata (`exiftool -all= FILE`) if they are wrong"
+_TO_SRGB = "export the image as 8-bit sRGB, or convert it (`mogrify -colorspace sRGB -depth 8`)"
+_STEREO = "it holds the views of two eyes: cut out the panorama of one eye"
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Position in pixels of a file's picture in its full panorama."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    full_width: int
+    full_height: int
+
+
+def _xmp(image: Image.Image) -> str:
+    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    if raw := image.info.get("Raw profile type xmp"):  # of ImageMagick, in hexadecimal after three lines
+        packet = bytes.fromhex("".join((raw if isinstance(raw, str) else raw.decode("latin-1")).split("\n")[3:]))
+    return packet if isinstance(packet, str) else packet.decode("utf-8", errors="replace").replace("\0", "")
+
+
+def _stated(xmp: str, name: str) -> str | None:
+    """Return the value of a property, written as an attribute or as an element."""
+    found = re.search(rf"""[:<]{name}\s*(?:=\s*["']([^"']*)["']|>([^<]*)<)""", xmp)
+    return None if found is None else (found[1] if found[1] is not None else found[2]).strip()
+
+
+def load_late_chunks(image: Image.Image, data: bytes) -> None:
+    """Decode a PNG that has metadata behind its pixels, which Pillow reads only then."""
+    if image.format == "PNG" and any(kind in data[data.rfind(b"IDAT") :] for kind in (b"eXIf", b"iTXt", b"tEXt")):
+        image.load()
+
+
+def refuse_rotated(image: Image.Image, path: object) -> None:
+    """Refuse pixels that are stored rotated, by EXIF or XMP.
+
+    Raises:
+        DataError: the orientation is not upright.
+    """
+    has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
+    stated = {"EXIF": image.getexif().get(_ORIENTATION) if has_exif else 1, "XMP": _stated(_xmp(image), "Orientation")}
+    for source, orientation in stated.items():
+        if str(orientation) not in ("None", "0", "1"):
+            raise DataError(
+                f"{path} carries {source} orientation {orientation}: its pixels are stored rotated, and it is unknown "
+                "which orientation the poses refer to; store it upright (`mogrify -auto-orient`) or remove the flag"
+            )
+
+
+def refuse_several_pictures(image: Image.Image, path: object) -> None:
+    """Refuse animations, several pages and stereo pairs. Previews and gain maps beside a picture are no pictures.
+
+    Raises:
+        DataError: it is unknown which picture is meant.
+    """
+    count = getattr(image, "n_frames", 1)
+    if image.format == "MPO":
+        kinds = {str(entry["Attribute"]["MPType"]) for entry in image.mpinfo.get(0xB002, ())}  # type: ignore[attr-defined]
+        count = count if any("Multi-Frame" in kind for kind in kinds) else 1
+    if count > 1:
+        raise DataError(
+            f"{path} holds {count} pictures (an animation, pages or a stereo pair); save the one that is meant as a "
+            "file of its own (`magick 'FILE[0]' ONE.png`)"
+        )
+    mode = _stated(_xmp(image), "StereoMode")
+    if mode is not None and mode.casefold() not in ("", "mono", "none"):
+        raise DataError(f"{path} says that it is stereo ({mode}): {_STEREO}, or {_REMOVE}")
+
+
+def crop_of(image: Image.Image, path: object) -> Crop | None:
+    """Return where the picture lies in its panorama by GPano metadata; None if it is the whole panorama.
+
+    Raises:
+        DataError: another projection, or numbers that contradict each other.
+    """
+    xmp = _xmp(image)
+    projection = _stated(xmp, "ProjectionType")
+    if projection is not None and projection.casefold() != "equirectangular":
+        raise DataError(
+            f"{path} says that its projection is {projection!r}, not equirectangular; convert it with the program that "
+            f"made it, or {_REMOVE}"
+        )
+    texts = {name: _stated(xmp, name) for name in _CROP_PROPERTIES}
+    if all(text is None for text in texts.values()):
+        return None
+    said = ", ".join(f"{name} {text}" for name, text in texts.items() if text is not None)
+    contradiction = f"{path} contradicts itself: it is {image.width}x{image.height} and says {said}; {_REMOVE}"
+    usual = (image.width, image.height, image.width, image.height, 0, 0)
+    try:
+        full_width, full_height, width, height, left, top = (
+            int(value if text is None else text) for value, text in zip(usual, texts.values(), strict=True)
+        )
+    except ValueError as error:
+        raise DataError(contradiction) from error
+    is_inside = min(left, top) >= 0 and left + width <= full_width <= _WIDEST and top + height <= full_height <= _WIDEST
+    # Another program may have resized the picture, but not changed its proportions.
+    if not is_inside or min(width, height) < 1 or abs(image.width * height / (image.height * width) - 1) > 0.02:
+        raise DataError(contradiction)
+    if (width, height) == (full_width, full_height):
+        return None
+    scale = image.width / width
+    left, top, full_width, full_height = (round(scale * value) for value in (left, top, full_width, full_height))
+    return Crop(
+        left, top, image.width, image.height, max(full_width, left + image.width), max(full_height, top + image.height)
+    )
+
+
+def tilt_of(image: Image.Image) -> str | None:
+    """Return the stated pitch and roll of the camera; None if it was upright."""
+    xmp = _xmp(image)
+    angles = {name: _stated(xmp, f"Pose{name}Degrees") for name in ("Pitch", "Roll")}
+    found = [f"{name.lower()} {text}" for name, text in angles.items() if text and text.strip("+-0.") != ""]
+    return " and ".join(found) or None
+
+
+def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:
+    """Return the conversion to sRGB of RGB pixels by profile, gamma and colour space; None if they are sRGB.
+
+    Raises:
+        DataError: the colours are described in a way that is not supported.
+    """
+    header = data[: data.find(b"IDAT")] if image.format == "PNG" else b""
+    if (place := header.find(b"cICP")) >= 0 and header[place + 4 : place + 8] != bytes((1, 13, 0, 1)):
+        raise DataError(f"{path} has colours of video or HDR (cICP {[*header[place + 4 : place + 8]]}); {_TO_SRGB}")
+    if profile := image.info.get("icc_profile"):
+        try:
+            return _icc_conversion(profile)
+        except (ImageCms.PyCMSError, OSError, ImportError, ValueError, TypeError) as error:
+            raise DataError(f"{path} has an ICC profile that cannot be applied ({error}); {_TO_SRGB}") from error
+    exif = image.getexif() if image.format == "JPEG" else None
+    if exif and exif.get_ifd(ExifTags.IFD.Interop).get(1) == "R03":
+        raise DataError(f"{path} is in Adobe RGB by its EXIF data, without an ICC profile; {_TO_SRGB}")
+    if "srgb" in image.info:
+        return None
+    chromaticities = image.info.get("chromaticity", _SRGB_CHROMATICITIES)
+    if max(abs(a - b) for a, b in zip(chromaticities, _SRGB_CHROMATICITIES, strict=True)) > 0.01:
+        raise DataError(f"{path} has primaries that are not those of sRGB (chunk cHRM); {_TO_SRGB}")
+    gamma = image.info.get("gamma", _SRGB_GAMMA)
+    if abs(gamma - _SRGB_GAMMA) < 0.02:
+        return None
+    if not 0.05 < gamma < 20:
+        raise DataError(f"{path} has gamma {gamma:g} (chunk gAMA), which is unknown; {_TO_SRGB}")
+    light = (np.arange(256) / 255) ** (1 / gamma)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    table = np.round(255 * encoded).astype(int).tolist()
+    return lambda pixels: pixels.point(3 * table)
+
+
+@lru_cache(maxsize=16)
+def _icc_conversion(profile: bytes) -> Callable[[Image.Image], Image.Image] | None:
+    """Return the conversion by an ICC profile of RGB colours; None if that is sRGB, by what it does to colours."""
+    transform = ImageCms.buildTransform(
+        ImageCms.ImageCmsProfile(BytesIO(profile)),
+        ImageCms.createProfile("sRGB"),
+        "RGB",
+        "RGB",
+        ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        ImageCms.Flags.NOCACHE,  # the cache is not made for several threads
+    )
+    steps = np.arange(0, 256, 15, dtype=np.uint8)
+    colors = Image.fromarray(np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3))
+    converted = ImageCms.applyTransform(colors, transform)
+    assert converted is not None
+    if np.abs(np.asarray(converted).astype(int) - np.asarray(colors)).max() <= _SAME_COLOUR:
+        return None
+    return lambda pixels: cast(Image.Image, ImageCms.applyTransform(pixels, transform))
