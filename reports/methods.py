@@ -25,6 +25,7 @@ STATUS = {
     "sc_omnigs": "after the abstract and project page",
     "seam360gs": "after the abstract",
     "spags_narrow": "sorted, narrow filter",
+    "spags_tuned": "sorted, options of padgs+",
 }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,8 @@ from torch.autograd.function import once_differentiable
 
 from padgs.gaussians import Gaussians
 from padgs.methods.plus.smoothness import roughness
+from padgs.methods.splats.depth_initialization import MIN_PIXELS, solid_angle_pixels
+from padgs.methods.splats.importance import GROWN_PER_KEPT
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of, finest_pixels, smoothed_for_view
 from padgs.methods.splats.splats import TINY, Splats
@@ -21,45 +22,28 @@ from padgs.native.abi import AngularSizeArguments, pointer
 from padgs.render import RenderConfig
 from padgs.scene import View
 from padgs.training.model import State, TrainingRender
-from padgs.training.schedule import ParameterGroup
 
 if TYPE_CHECKING:
     from padgs.methods.plus.method import PlusOptions
 
 DEGREE_SHARE = 0.1  # of the run, between two SH degrees
 DROPOUT_UNTIL = 0.9  # share of the run after which no Gaussians are dropped
-GROWN_PER_KEPT = 2  # Gaussians before the pruning step per Gaussian after it, about
 CAMERAS = "cameras"  # key of the training cameras in a state
-MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more than each
-
-
-def solid_angle_pixels(view: View) -> float:
-    """Return the number of independent pixels of a panorama: W H times the mean cosine of the latitude, 2 / pi.
-
-    At least `MIN_PIXELS`. Numbers of points and Gaussians are multiples of it.
-    """
-    return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)
 
 
 class PlusModel(SplatModel):
     """Splats with the schedule of padgs_plus for a run of `iterations`."""
 
-    def __init__(
-        self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
-    ) -> None:
-        """Take arguments of `SplatModel`; `limit` is the maximal number of Gaussians."""
+    def __init__(self, splats: Splats, options: PlusOptions, config: RenderConfig, **kwargs: Any) -> None:
+        """Take arguments of `SplatModel`."""
         views = kwargs.get("views", ())
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
-        super().__init__(splats, replace(options.for_views(largest, len(views)), max_gaussians=limit), config, **kwargs)
+        super().__init__(splats, options.for_views(largest, len(views)), config, **kwargs)
         self.options = options
         self._step = 0  # last step of the schedule
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
         self._finest: tuple[Tensor, Tensor] | None = None  # means, and the finest training pixel at each
-
-    def groups(self, means_rate_factor: float = 1.0) -> list[ParameterGroup]:
-        """Return the learning rates of 3DGS with a factor on that of the means."""
-        return super().groups(means_rate_factor * self.options.means_rate_factor)
 
     def degree_at(self, iteration: int) -> int:
         """Return the scheduled SH degree: one more after each `DEGREE_SHARE` of the run."""

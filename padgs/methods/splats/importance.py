@@ -18,6 +18,7 @@ from padgs.scene import View
 from padgs.training.model import Prunable
 from padgs.training.targets import even_weight, image_of
 
+GROWN_PER_KEPT = 2  # Gaussians before the pruning step per Gaussian after it, about
 MIN_KEPT_SHARE = 0.1  # of the rows stays in one pruning step, whatever the scores
 
 

@@ -8,16 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 
 from padgs.checks import check
 from padgs.geometry.harmonics import MAX_DEGREE
 from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.depth_initialization import (
+    far_gaussians,
+    fill_sparse_cloud,
+    room_count,
+    solid_angle_pixels,
+)
+from padgs.methods.splats.importance import GROWN_PER_KEPT
 from padgs.methods.splats.model import SplatModel
-from padgs.methods.splats.splats import Splats
+from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
 from padgs.scene import Scene, View
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.method import Method
@@ -32,6 +39,14 @@ class SplatOptions(DensificationOptions, ExtentOptions):
     """The `method` group of the configuration: the model and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
+    initial_opacity: float = INITIAL_OPACITY  # hides what lies in front until opacities have grown
+    initial_scale: float = 1.0  # times the distance of the nearest points; below 1 Gaussians do not overlap at first
+    initial_per_pixel: float | None = None  # initial points per independent pixel of a view; None: all points
+    depth_init_per_pixel: float = 0.0  # a sparser cloud is filled from training pixels by plane sweep; 0: never
+    sky_per_point: float = 0.0  # directions per initial point that get a far Gaussian if no point is there
+    limit_per_pixel: float | None = None  # maximal Gaussians per independent pixel, which bounds memory and time
+    means_rate_factor: float = 1.0  # on the learning rate of the means in 3DGS
+    prune_psnr: float | None = None  # dB of the pruning step, see `count_for_psnr`; None: by `budget.gaussians` only
     # Variance in square pixels of the finest training view (3D smoothing filter of Mip-Splatting and SPaGS,
     # `padgs.methods.splats.smoothing_filter`); 0: none.
     smoothing_filter: float = 0.0
@@ -41,6 +56,13 @@ class SplatOptions(DensificationOptions, ExtentOptions):
             part.__post_init__(self)
         check(self, f"0 to {MAX_DEGREE}", lambda degree: 0 <= degree <= MAX_DEGREE, "sh_degree")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "smoothing_filter")
+        check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
+        check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_rate_factor")
+        check(self, "> 0 and finite, or none for no pruning", lambda p: p is None or 0 < p < math.inf, "prune_psnr")
+        off = "at least 0, which switches it off"
+        check(self, off, lambda value: 0 <= value < math.inf, "sky_per_point", "depth_init_per_pixel")
+        limits = ("initial_per_pixel", "limit_per_pixel")
+        check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, *limits)
 
 
 def lowest_limit(*limits: int | None) -> int | None:
@@ -54,6 +76,7 @@ class SplatMethod(Method):
     Options = SplatOptions
     MODEL: ClassVar[Callable[..., SplatModel]] = SplatModel
     TRAIN = TrainOptions(weight="uniform")
+    _filled: tuple[Scene, int, Scene, torch.Tensor] | None = None  # last arguments and result of `_filled_scene`
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()
@@ -66,20 +89,46 @@ class SplatMethod(Method):
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
         """See `Method.build_model`."""
         options = self.options
+        shares = (options.initial_per_pixel, options.limit_per_pixel, options.depth_init_per_pixel or None)
+        pixels = room_count(scene) * solid_angle_pixels(scene.train[0]) if any(shares) else 0.0
+        start, limit, filled = (None if share is None else max(1, round(share * pixels)) for share in shares)
+        limit = lowest_limit(options.max_gaussians, limit if self._target is None else self._target)
+        for_points = None if limit is None else math.ceil(limit / (1 + options.sky_per_point))
+        start = lowest_limit(start, for_points)
+        points, generator = self._filled_scene(scene, 0 if filled is None else lowest_limit(filled, start))
+        splats = Splats.from_scene(
+            points,
+            degree=options.sh_degree,
+            max_gaussians=start,
+            opacity=options.initial_opacity,
+            scale=options.initial_scale,
+            generator=generator,
+        )
+        directions = round(options.sky_per_point * len(splats))
+        directions = directions if limit is None else min(directions, limit - len(splats))
+        if directions > 0:
+            sky = far_gaussians(scene, directions, degree=options.sh_degree, opacity=options.initial_opacity)
+            splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
+        return self._model_of(splats, options.extent_of(scene), iterations, scene.train, limit)
+
+    def _filled_scene(self, scene: Scene, count: int) -> tuple[Scene, torch.Generator]:
+        """Return the scene with its cloud filled up to `count` points, and the generator of further random choices.
+
+        Computed once for a rehearsal and its run; not if the parameters come from another model.
+        """
         generator = torch.Generator().manual_seed(self.seed)
-        limit = lowest_limit(options.max_gaussians, self._target)
-        splats = Splats.from_scene(scene, degree=options.sh_degree, max_gaussians=limit, generator=generator)
-        return self._model_of(splats, options.extent_of(scene), iterations, scene.train)
+        if count == 0 or self._loaded_state is not None or self._warm_start_state is not None:
+            return scene, generator
+        if self._filled is None or self._filled[0] is not scene or self._filled[1] != count:
+            self._filled = scene, count, fill_sparse_cloud(scene, count, generator=generator), generator.get_state()
+        generator.set_state(self._filled[3])
+        return self._filled[2], generator
 
     @property
     def _target(self) -> int | None:
-        """Number of Gaussians that densification aims at, if the budget is a number."""
-        return self._gaussians if isinstance(self._gaussians, int) else None
-
-    @property
-    def _prune_psnr(self) -> float | None:
-        """PSNR of the pruning step, dB; None without pruning."""
-        return PRUNE_PSNR if self._gaussians == AUTO else None
+        """Number of Gaussians that densification aims at, if the budget is a number; twice that before pruning."""
+        requested = self._gaussians if isinstance(self._gaussians, int) else None
+        return requested if requested is None or self.options.prune_psnr is None else GROWN_PER_KEPT * requested
 
     def restore(self, state: State) -> SplatModel:
         """See `Method.restore`."""
@@ -89,12 +138,18 @@ class SplatMethod(Method):
         return self._model_of(splats, values["extent"], values["iterations"])
 
     def _model_of(
-        self, splats: Splats, extent: float, iterations: int, views: Sequence[View] = (), **more: Any
+        self,
+        splats: Splats,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        limit: int | None = None,
     ) -> SplatModel:
-        """Return the trainable model; `more` are further arguments of `MODEL`."""
+        """Return the trainable model; `limit` is the maximal number of Gaussians."""
+        options = self.options
         return self.MODEL(
             splats,
-            self.options,
+            replace(options, max_gaussians=limit),
             self.render_config,
             extent=extent,
             iterations=iterations,
@@ -102,7 +157,7 @@ class SplatMethod(Method):
             target=self._target,
             seed=self.seed,
             requested=self._gaussians,
-            prune_psnr=self._prune_psnr,
-            smoothing_filter=self.options.smoothing_filter,
-            **more,
+            prune_psnr=options.prune_psnr or (PRUNE_PSNR if self._gaussians == AUTO else None),
+            smoothing_filter=options.smoothing_filter,
+            means_rate_factor=options.means_rate_factor,
         )

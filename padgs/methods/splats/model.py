@@ -51,6 +51,7 @@ class SplatModel:
         requested: int | str | None = None,
         prune_psnr: float | None = None,
         smoothing_filter: float = 0.0,
+        means_rate_factor: float = 1.0,
     ) -> None:
         """Wrap splats for a run of `iterations`, with training `views` unless they are only rendered.
 
@@ -58,7 +59,7 @@ class SplatModel:
         `prune_psnr` as in `PruningStep`; `smoothing_filter` is the variance of `SmoothingFilter`, 0 for none.
         """
         self.splats, self.options, self.iterations = splats, options, iterations
-        self._config, self._views, self._extent = config, views, extent
+        self._config, self._views, self._extent, self._means_rate_factor = config, views, extent, means_rate_factor
         self.densifier = Densifier(
             splats,
             options.for_run(iterations),
@@ -72,9 +73,9 @@ class SplatModel:
         if self._filter is not None:
             self._filter.update(splats.means)
 
-    def groups(self, means_rate_factor: float = 1.0) -> list[ParameterGroup]:
+    def groups(self) -> list[ParameterGroup]:
         """Return the learning rates of 3DGS; that of the means decays over the run and scales with the extent."""
-        splats, factor = self.splats, means_rate_factor * self._extent
+        splats, factor = self.splats, self._means_rate_factor * self._extent
         rates = {
             "means": LogLinear(1.6e-4 * factor, 1.6e-6 * factor, self.iterations),
             "quats": Constant(1e-3),

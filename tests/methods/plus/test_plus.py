@@ -20,8 +20,8 @@ from padgs.methods.plus.method import (
     PlusOptions,
     iterations_per_round,
 )
-from padgs.methods.plus.model import MIN_PIXELS, solid_angle_pixels
 from padgs.methods.plus.smoothness import roughness
+from padgs.methods.splats.depth_initialization import MIN_PIXELS, solid_angle_pixels
 from padgs.methods.splats.importance import count_for_psnr, importance_scores
 from padgs.methods.splats.method import SplatMethod
 from padgs.scene import Scene

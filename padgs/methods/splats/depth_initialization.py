@@ -1,6 +1,6 @@
-"""Initial Gaussians of padgs_plus beyond the point cloud: training pixels with estimated depth, and far Gaussians.
+"""Initial Gaussians beyond the point cloud: training pixels with estimated depth, and far Gaussians.
 
-Also measures `room_count`, by which numbers of points and Gaussians are multiplied.
+Numbers of points and Gaussians are multiples of `solid_angle_pixels` times `room_count`.
 """
 
 from __future__ import annotations
@@ -39,6 +39,15 @@ POINTS_PER_BIN = 16  # of directions, on average
 SURFACE_RANK = 3  # the nearest points of a bin may float; this one is on a surface
 OCCLUSION_FACTOR = 1.5  # a point farther than so many times the surface is occluded
 SINGLE_ROOM = 1.3  # inverse visible share in one room, because of furniture
+MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more than each
+
+
+def solid_angle_pixels(view: View) -> float:
+    """Return the number of independent pixels of a panorama: W H times the mean cosine of the latitude, 2 / pi.
+
+    At least `MIN_PIXELS`.
+    """
+    return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)
 
 
 def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:

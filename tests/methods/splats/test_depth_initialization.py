@@ -11,9 +11,10 @@ from torch import Tensor
 from padgs.data.perturb import StressOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.geometry.camera import perspective
-from padgs.methods.plus import depth_initialization
-from padgs.methods.plus import method as method_module
-from padgs.methods.plus.depth_initialization import (
+from padgs.methods.plus.method import PlusMethod, PlusOptions
+from padgs.methods.splats import depth_initialization
+from padgs.methods.splats import method as method_module
+from padgs.methods.splats.depth_initialization import (
     CHUNK,
     COVERED_SPACINGS,
     FAR_FACTOR,
@@ -22,9 +23,8 @@ from padgs.methods.plus.depth_initialization import (
     fill_sparse_cloud,
     plane_sweep,
     room_count,
+    solid_angle_pixels,
 )
-from padgs.methods.plus.method import PlusMethod, PlusOptions
-from padgs.methods.plus.model import solid_angle_pixels
 from padgs.methods.splats.splats import Splats
 from padgs.scene import Scene, View
 from padgs.training.options import Budget
