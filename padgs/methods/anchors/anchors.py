@@ -23,7 +23,7 @@ from padgs.methods.anchors.decoder import (
     decode_with_capacity,
     supports_capacity,
 )
-from padgs.methods.anchors.precision import PRECISIONS
+from padgs.methods.anchors.native_decoder import PRECISIONS
 from padgs.native.cuda import HostCopy
 from padgs.scene import Scene, View
 from padgs.training.initial_points import refuse_unusable, squared_spacing

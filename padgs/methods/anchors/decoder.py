@@ -21,8 +21,9 @@ from padgs.methods.anchors.native_decoder import (
     OPACITY_VALUES,
     decode_on_cpu,
     decode_on_gpu,
+    linear,
+    reduced_dtype,
 )
-from padgs.methods.anchors.precision import linear, reduced_dtype
 from padgs.native import LIBRARIES, cpu, cuda
 
 FILTER_BELOW = 0.9  # share of anchors with a positive opacity
@@ -37,7 +38,7 @@ class Head(NamedTuple):
     b2: Tensor  # [O]
 
     def __call__(self, inputs: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Return outputs [A, O] for inputs [A, I]; products in `dtype`, see `padgs.methods.anchors.precision`."""
+        """Return outputs [A, O] for inputs [A, I]; products in `dtype`, see `padgs.methods.anchors.native_decoder`."""
         hidden = torch.relu(linear(inputs, self.w1, self.b1, dtype))
         return linear(hidden, self.w2, self.b2, dtype)
 
@@ -79,7 +80,7 @@ def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = 
     Other outputs are never used, so the result is exact. If most anchors have one, all are decoded, which is faster
     than filtering.
 
-    `inputs` are [A, I]; `dtype` is that of the products, see `padgs.methods.anchors.precision`.
+    `inputs` are [A, I]; `dtype` is that of the products, see `padgs.methods.anchors.native_decoder`.
     """
     raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
     count, offsets = raw_opacities.shape
@@ -110,7 +111,7 @@ def decode_gaussians(
     """Return the selected Gaussians of all anchors (Eq. 13-15).
 
     Differentiable by weights, features, offsets and log-scales. `precision` is a name of
-    `padgs.methods.anchors.precision.PRECISIONS`; reduced ones are made for GPUs and slower on the CPU.
+    `padgs.methods.anchors.native_decoder.PRECISIONS`; reduced ones are made for GPUs and slower on the CPU.
 
     Returns:
         N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient.

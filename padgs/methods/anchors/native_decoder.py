@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from padgs.methods.anchors.precision import GRADIENT_TYPE
 from padgs.native import cpu, cuda
 from padgs.native.abi import DecodeArguments, DecodeGradientArguments, HeadWeights, pointer
 from padgs.native.cuda import DeviceDecodeArguments, DeviceDecodeGradientArguments, NetworkInputs
@@ -28,6 +27,39 @@ SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacitie
 ALIGNMENT = 8  # rows of inputs are padded with zeros to a multiple: cuBLAS is slower for unaligned rows
 CHUNK = 4096  # anchors in one part of a product that sums over anchors
 REDUCED_TYPES = {torch.bfloat16: 0, torch.float16: 1}  # as `ReducedType` of csrc/cuda/arguments.h
+# In a reduced precision parameters and results stay float32; operands are rounded for a product, which is summed in
+# float32 and rounded once. torch on a GPU may round partial sums too (torch.backends.cuda.matmul), the kernels do not.
+# Products of gradients are always in bfloat16: gradients of a mean over pixels are too small for float16.
+PRECISIONS = ("float32", "bfloat16", "float16")
+GRADIENT_TYPE = torch.bfloat16
+
+
+def reduced_dtype(precision: str) -> torch.dtype | None:
+    """Return the type of a precision; None for float32, the tensors' own type."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"unknown precision {precision!r}; known: {', '.join(PRECISIONS)}")
+    return None if precision == "float32" else getattr(torch, precision)
+
+
+def linear(inputs: Tensor, weight: Tensor, bias: Tensor, dtype: torch.dtype | None) -> Tensor:
+    """Apply a layer of weight [O, I] and bias [O] to inputs [A, I] with a product in `dtype`, None: their type."""
+    if dtype is None:
+        return torch.addmm(bias, inputs, weight.T)
+    return _ReducedLinear.apply(inputs, weight, bias, dtype)
+
+
+class _ReducedLinear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, dtype: torch.dtype) -> Tensor:
+        ctx.save_for_backward(inputs, weight)
+        return torch.addmm(bias.to(dtype), inputs.to(dtype), weight.to(dtype).T).to(inputs.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        inputs, weight = (tensor.to(GRADIENT_TYPE) for tensor in ctx.saved_tensors)
+        rounded = grad.to(GRADIENT_TYPE)
+        return (rounded @ weight).to(grad.dtype), (rounded.T @ inputs).to(grad.dtype), grad.sum(0), None
 
 
 def decode_on_cpu(weights: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:

@@ -17,7 +17,7 @@ from padgs.methods.anchors.decoder import (
     define_gaussians,
     take_rows,
 )
-from padgs.methods.anchors.precision import GRADIENT_TYPE, linear
+from padgs.methods.anchors.native_decoder import GRADIENT_TYPE, linear
 from padgs.native import cpu
 
 

@@ -20,8 +20,7 @@ from padgs.methods.anchors.decoder import (
     decode_with_capacity,
     define_gaussians,
 )
-from padgs.methods.anchors.native_decoder import decode_on_gpu
-from padgs.methods.anchors.precision import GRADIENT_TYPE, PRECISIONS, reduced_dtype
+from padgs.methods.anchors.native_decoder import GRADIENT_TYPE, PRECISIONS, decode_on_gpu, reduced_dtype
 from padgs.native.loading import call_hook
 
 pytestmark = [*cuda_engine.marks()]

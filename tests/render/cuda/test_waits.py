@@ -19,7 +19,7 @@ from torch import Tensor
 from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.model import AnchorModel
-from padgs.methods.anchors.precision import PRECISIONS
+from padgs.methods.anchors.native_decoder import PRECISIONS
 from padgs.methods.splats.densification import POSITIONAL_GRADIENTS, DensificationOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats

@@ -1,5 +1,5 @@
 // The decoder's three networks w2 relu(w1 x + b1) + b2 on tensor cores, sixteen anchors a warp. Factors are rounded to a
-// reduced type, hidden units and outputs are rounded once, as padgs/methods/anchors/precision.py defines it. Hidden units never
+// reduced type, hidden units and outputs are rounded once, as padgs/methods/anchors/native_decoder.py defines it. Hidden units never
 // leave their warp: sums of one product are the factor of the next.
 #pragma once
 
