@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
@@ -38,9 +39,22 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         OSError: it was not written, or cannot replace `path`.
     """
+    check_place(path)
     with draft_of(path) as draft:
         yield draft
         os.replace(draft, path)
+
+
+def check_place(path: Path) -> None:
+    """Check that a file can be written, before work that may take minutes.
+
+    Raises:
+        OSError: there is a folder of this name, or the folder of the file is missing or read-only.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    with draft_of(path) as draft:
+        draft.touch()
 
 
 @contextmanager

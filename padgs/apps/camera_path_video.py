@@ -17,6 +17,7 @@ from uuid import UUID
 import numpy as np
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from padgs.checks import install_command
@@ -117,7 +118,8 @@ def write_video(
         if is_mp4:
             writers = [stack.enter_context(_mp4(path, views[0], fps, spherical)) for path in outputs]
         else:
-            writers = [stack.enter_context(_png_folder(path)) for path in outputs]
+            texts = ("", depth_unit(to, scene_scale))
+            writers = [stack.enter_context(_png_folder(*each)) for each in zip(outputs, texts, strict=False)]
         for number, view in enumerate(views):
             rendering = render(view)
             writers[0](to_uint8(rendering.image))
@@ -129,21 +131,31 @@ def write_video(
     return outputs
 
 
+def depth_unit(to: Path, scene_scale: float) -> str:
+    """Return what the values of written depths mean; PNGs hold it as their description."""
+    if to.suffix.lower() == ".mp4":
+        return "depth: bright is near, black is empty; a folder of PNGs holds it in numbers"
+    unit = scene_scale / DEPTH_STEPS
+    return f"depth: one step is {unit:.6g} world units of the data set; 0 is empty, 65535 is {65535 * unit:.6g} or more"
+
+
 def _sixteen_bit(depth: Tensor) -> np.ndarray:
     return (depth * DEPTH_STEPS).round().clamp(0, 2**16 - 1).cpu().numpy().astype(np.uint16)
 
 
 @contextmanager
-def _png_folder(path: Path) -> Iterator[WriteFrame]:
+def _png_folder(path: Path, description: str) -> Iterator[WriteFrame]:
     path.mkdir(parents=True, exist_ok=True)
     if stale := next(path.glob("*.png"), None):
         raise ValueError(f"{path} already holds images, such as {stale.name}; choose another folder with --to")
-    numbers = iter(range(1, 1 << 30))
+    numbers, info = iter(range(1, 1 << 30)), PngInfo()
+    if description:
+        info.add_text("Description", description)
     with draft_of(path / "frames") as draft:  # an interrupted call must not block the next
         draft.mkdir()
 
         def write(frame: np.ndarray) -> None:
-            Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png")
+            Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png", pnginfo=info)
 
         yield write
         for image in sorted(draft.iterdir()):

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from padgs.cli.errors import MAX_SEED, MAX_THREADS, check_range, show
+
 
 def bench(
     out: Annotated[str, typer.Option(help="folder for bench.json")] = "runs/bench",
@@ -24,6 +26,9 @@ def bench(
 
     from padgs.apps.bench.report import QUICK, BenchOptions, lines, measure_all
 
+    check_range(0, MAX_THREADS, threads=threads)
+    check_range(0, 10_000, repeats=repeats)
+    check_range(0, MAX_SEED, seed=seed)
     usual = QUICK if quick else BenchOptions(repeats=10 if device == "cpu" else 50)
     sizes = (*usual.sizes, "large") if full else usual.sizes
     options = replace(
@@ -34,4 +39,4 @@ def bench(
         report = measure_all(options, lambda what: status.update(f"measuring {what}"), file)
     for line in lines(report):
         console.print(line)
-    print(f"written: {file}")
+    show(f"written: {file}")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import show
+from padgs.cli.errors import check_range, show
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, roam360, ricoh360, omniblender, released"
 
@@ -29,6 +29,7 @@ def convert(
     from padgs.data.capture import DataOptions
     from padgs.data.formats.convert import convert as write
 
+    check_range(0, 65536, width=width)
     with Console().status("reading") as status:
         scene = write(
             Path(source),

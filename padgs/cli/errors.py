@@ -15,6 +15,7 @@ from padgs.runs.console import printable
 from padgs.runs.interrupt import INTERRUPTED
 
 Run = Annotated[str, typer.Argument(help="folder of a run, finished or not, as padgs-run names it at its end")]
+MAX_SEED, MAX_THREADS = 2**32 - 1, 1024
 DataPath = Annotated[str | None, typer.Option("--data", help="new place of its data set, if it has moved")]
 
 
@@ -51,6 +52,17 @@ def _hint(error: Exception, *, run: str = "", beside: str = "", data: str | None
         return ""
     runs = " or ".join(filter(None, (run, beside)))
     return f"; it is the data of {runs}: if it has moved, name its place with --data"
+
+
+def check_range(low: float, high: float, **options: float | None) -> None:
+    """Refuse a value outside a range.
+
+    Raises:
+        ValueError: "--NAME is VALUE; it must be from LOW to HIGH".
+    """
+    for name, value in options.items():
+        if value is not None and not low <= value <= high:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}; it must be from {low} to {high}")
 
 
 @contextmanager

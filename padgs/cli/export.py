@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, name_place, show
+from padgs.cli.errors import DataPath, Run, check_range, name_place, show
 
 LONG = 60.0  # seconds of writing; announced beforehand if it takes longer
 
@@ -20,7 +20,8 @@ def export(
         bool, typer.Option("--smooth", help="at least a pixel wide, for viewers; .html always is")
     ] = False,
     distillation_steps: Annotated[
-        int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
+        int | None,
+        typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300"),
     ] = None,
     data: DataPath = None,
 ) -> None:
@@ -38,8 +39,10 @@ def export(
     from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run, point_cloud
     from padgs.apps.export.splat_file import check_suffix, estimate_seconds, write_splats
     from padgs.data.cloud import write_ply
+    from padgs.files import check_place
     from padgs.runs.load import load_run
 
+    check_range(0, 100_000, distillation_steps=distillation_steps)
     steps = DISTILLATION_STEPS if distillation_steps is None else distillation_steps
     path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
     if points and path.suffixes != [".ply"]:
@@ -49,6 +52,7 @@ def export(
         trained = load_run(run, data_path=data)
         with name_place(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            check_place(path)
         found = export_run(
             trained,
             distillation_steps=steps,

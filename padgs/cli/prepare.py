@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from padgs.cli.errors import show
+from padgs.cli.errors import MAX_SEED, MAX_THREADS, check_range, show
 from padgs.runs.interrupt import Interrupted
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ def prepare(
     per_second: Annotated[float, typer.Option(help="frames kept per second of video")] = 2.0,
     seed: Annotated[int, typer.Option(help="of all random choices")] = 0,
     threads: Annotated[
-        int, typer.Option(help="processor threads; 0 = all, at most 8, as free memory allows; fewer take less memory")
+        int,
+        typer.Option(help="processor threads; 0 = all, at most 8, as free memory allows; fewer take less memory"),
     ] = 0,
 ) -> None:
     """Find the poses of panoramas, then check the result. After an interruption, the same command continues."""
@@ -48,6 +49,9 @@ def prepare(
     from padgs.data.prepare.pipeline import prepare as find_poses
     from padgs.data.prepare.work import PrepareOptions
 
+    check_range(0, MAX_SEED, seed=seed)
+    check_range(0, MAX_THREADS, threads=threads)
+    check_range(0.001, 1000, per_second=per_second)
     target = Path(destination)
     try:
         with _bars() as tell:

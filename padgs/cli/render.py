@@ -6,7 +6,9 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, name_place
+from padgs.cli.errors import DataPath, Run, check_range, name_place, show
+
+MAX_SIDE, MAX_FRAMES = 16384, 100_000  # larger images and longer videos fill the memory
 
 
 def render(
@@ -29,16 +31,21 @@ def render(
 
     from rich.console import Console
 
-    from padgs.apps.camera_path_video import views_along, write_video
+    from padgs.apps.camera_path_video import depth_unit, views_along, write_video
     from padgs.runs.load import load_run
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
     if camera == "panorama" and (fov is not None or height is not None):
         raise ValueError("--fov and --height belong to perspective images: add --camera perspective")
-    if not (fps > 0 and (seconds is None or seconds > 0)):
-        wrong = f"--fps is {fps:g}" if seconds is None or seconds > 0 else f"--seconds is {seconds:g}"
-        raise ValueError(f"{wrong}, which makes a video without frames; it must be > 0")
+    check_range(0.01, 1000, fps=fps)
+    check_range(2, MAX_SIDE, width=width or None)
+    check_range(1, MAX_SIDE, height=height)
+    if seconds is not None and not 0 < seconds * fps <= MAX_FRAMES:
+        raise ValueError(
+            f"--seconds is {seconds:g}, which makes {seconds * fps:g} frames at --fps {fps:g}; it must be above 0 and "
+            f"at most {MAX_FRAMES / fps:g}"
+        )
     with Console().status("opening the run") as status:
         found = load_run(run, data_path=data)
         shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
@@ -57,4 +64,6 @@ def render(
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),
             )
     for written in outputs:
-        print(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")
+        show(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")
+    if depth:
+        show(f"  {depth_unit(output, found.scene.scale)}")

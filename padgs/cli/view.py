@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from padgs import results
-from padgs.cli.errors import DataPath, Run
+from padgs.cli.errors import DataPath, Run, check_range
 
 if TYPE_CHECKING:
     from padgs.runs.load import LoadedRun
@@ -28,6 +28,7 @@ def view(
     from padgs.apps.viewer.process import has_screen, serve
     from padgs.apps.viewer.server import LOCAL, PORT
 
+    check_range(1, 65535, port=port)
     folders = (run, beside) if beside else (run,)
 
     def of_one_scene() -> list[LoadedRun]:

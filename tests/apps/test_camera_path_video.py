@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from padgs.apps.camera_path_video import write_video
 from padgs.cli.commands import app
+from padgs.runs.load import load_run
 from padgs.scene import View
 
 try:
@@ -23,6 +24,7 @@ except ImportError:
 WITH_VIDEO = pytest.mark.skipif(imageio is None, reason="the extra `video` is not installed")
 COLOURS = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
 SHOWN = SimpleNamespace(image=COLOURS.repeat_interleave(16, 0).expand(32, 64, 3))  # a column of each
+BAD_NUMBERS, BAD_SIDES = ("inf", "nan", "-1", "0", "1e30"), ("-1", "1000000000")
 VIEW = View("a", torch.eye(4, dtype=torch.float64), 64, 32)
 
 
@@ -116,14 +118,21 @@ def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
     assert np.abs(panorama[7:9, 15:17].mean((0, 1)) - perspective[1:3, 3:5].mean((0, 1))).max() < 12
     depth = np.array(Image.open(tmp_path / "q-depth" / "00001.png"))
     assert depth.dtype == np.uint16 and depth.min() > 0
+    unit = load_run(folder).scene.scale / 1000
+    assert f"one step is {unit:.6g} world units" in Image.open(tmp_path / "q-depth" / "00001.png").text["Description"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
-        (("--fps", "0"), "--fps is 0, which makes a video without frames; it must be > 0"),
-        (("--seconds", "0"), "--seconds is 0, which makes a video"),
+        *((("--fps", value), f"--fps is {float(value)}; it must be from 0.01 to 1000") for value in BAD_NUMBERS),
+        *((("--seconds", value), f"--seconds is {float(value):g}, which makes") for value in BAD_NUMBERS),
+        *((("--width", value), f"--width is {value}; it must be from 2 to 16384") for value in BAD_SIDES),
+        *(
+            (("--camera", "perspective", "--height", value), f"--height is {value}; it must be from 1 to 16384")
+            for value in ("0", *BAD_SIDES)
+        ),
         (("--height", "9"), "belong to perspective images: add --camera perspective"),
         (("--path", "spiral"), "the path spiral does not exist; known: cameras, orbit, dolly"),
         (("--camera", "perspective", "--fov", "180"), "and 180 degrees is impossible"),
@@ -144,6 +153,9 @@ def test_errors_name_the_option_for_output_and_data(folder, tmp_path):
     (tmp_path / "file").touch()
     result = render(str(folder), "--to", str(tmp_path / "file"), "--seconds", "0.1", "--fps", "20")
     assert result.exit_code == 1 and f"cannot write {tmp_path}/file: " in result.stderr and "with --to" in result.stderr
+    (tmp_path / "a.mp4").mkdir()
+    result = render(str(folder), "--to", str(tmp_path / "a.mp4"), "--seconds", "0.1", "--fps", "20")
+    assert result.exit_code == 1 and "a.mp4: Is a directory; name another place with --to" in result.stderr
     result = render(str(folder), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "f"))
     assert result.exit_code == 1 and f"it is the data of {folder}: if it has moved" in result.stderr
 

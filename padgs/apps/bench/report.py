@@ -40,7 +40,7 @@ from padgs.apps.bench.stages import STAGES, WARM_UP, cpu_stages, device_stages
 from padgs.apps.bench.tile_counts import tiles_by_latitude
 from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, median_sigma
 from padgs.checks import check, check_known
-from padgs.files import write_atomically
+from padgs.files import check_place, write_atomically
 from padgs.native import cpu, cuda
 from padgs.render import Rendering, render
 
@@ -89,7 +89,8 @@ def measure_all(
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/cuda.md")
     if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)  # before minutes of measuring, not after
+        file.parent.mkdir(parents=True, exist_ok=True)
+        check_place(file)
     with clock.threads(options.threads or clock.machine()["cores"]):
         progress("the ceilings of this machine")
         ceilings = measure_ceilings(device, options.ceiling_seconds)
