@@ -33,6 +33,22 @@ def check_known(options: object, **known: Collection[str]) -> None:
             raise ValueError(f"unknown {name} {value!r}; known: {', '.join(names)}")
 
 
+# Least and greatest numbers by the name of their key or its last word, and for all others by type. Beyond them a number
+# means nothing, or asks for more than a machine has.
+LIMITS: dict[object, tuple[int, int]] = {
+    "iterations": (1, 10**8),
+    "seconds": (0, 10**8),
+    **dict.fromkeys(("threads", "jobs"), (1, 1024)),
+    "prefetch_threads": (0, 1024),
+    **dict.fromkeys(("width", "height", "face_size"), (0, 2**16)),
+    **dict.fromkeys(("views", "samples", "objects", "rooms", "spokes", "nodes", "pass", "filter"), (0, 10**4)),
+    **dict.fromkeys(("features", "hidden", "offsets", "components", "levels", "frequencies"), (0, 1024)),
+    **dict.fromkeys(("bytes", "cap", "instances"), (0, 10**15)),
+    "points": (0, 10**8),
+    "seed": (0, 2**63 - 1),
+    int: (0, 10**9),
+    float: (-(10**6), 10**6),
+}
 T = TypeVar("T")
 
 
@@ -76,8 +92,22 @@ def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
         raise ConfigError(f"{where}: {error}" if where else str(error)) from error
 
 
+def _refuse_beyond_limits(kinds: tuple[Any, ...], value: Any, where: str) -> None:
+    numeric = {int, float} & {*kinds}
+    if not numeric or not isinstance(value, (int, float)) or isinstance(value, bool):
+        return
+    if not -sys.float_info.max <= value <= sys.float_info.max:
+        raise ConfigError(f"{where} is {value}; it must be finite")
+    name = where.rpartition(".")[2].partition("[")[0]
+    usual = LIMITS[float if float in numeric else int]
+    low, high = LIMITS.get(name) or LIMITS.get(name.rpartition("_")[2], usual)
+    if not low <= value <= high:
+        raise ConfigError(f"{where} is {value}; it must be from {low} to {high}")
+
+
 def _value(kind: Any, value: Any, where: str) -> Any:
     origin = get_origin(kind)
+    _refuse_beyond_limits((kind, *get_args(kind)), value, where)
     if kind is Any:
         return value
     if origin in (Union, types.UnionType):
@@ -97,11 +127,9 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         if any(0xD800 <= ord(character) < 0xE000 for character in value):
             raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename the file or value")
         return value
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not -sys.float_info.max <= value <= sys.float_info.max:
-            raise ConfigError(f"{where} is {value}; it must be finite")
-        if kind is float or kind is int and value == int(value):
-            return kind(value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if is_number and (kind is float or kind is int and value == int(value)):
+        return kind(value)
     raise ConfigError(f"{where} is {value!r}; it must be {_name(kind)}")
 
 
@@ -147,3 +175,13 @@ def install_command(extra: str) -> str:
     import shlex
 
     return shlex.join([sys.executable, "-m", "pip", "install", f"padgs[{extra}]"])
+
+
+def printable(text: str) -> str:
+    r"""Return a text with escapes for control characters and for code points without encoding.
+
+    >>> printable("caf\u00e9 \x1b[2J \udce9")
+    'café \\x1b[2J \\udce9'
+    """
+    shown = "".join(c if c.isprintable() or c in "\n\t" or ord(c) > 0xFF else f"\\x{ord(c):02x}" for c in text)
+    return shown.encode("utf-8", "backslashreplace").decode()

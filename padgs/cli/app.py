@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-
-from padgs.runs.interrupt import INTERRUPTED
+from padgs.runs.interrupt import ending_by_signals
 
 
 def main() -> None:
-    """Entry point of `padgs`; exit code 130 if stopped by Ctrl-C while it starts."""
-    try:
+    """Entry point of `padgs`."""
+    with ending_by_signals():
         from padgs.cli.commands import app
 
         app()
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from padgs.runs.console import printable
-from padgs.runs.interrupt import INTERRUPTED
+from padgs.checks import printable
+from padgs.runs.interrupt import ending_by_signals
 
 Run = Annotated[str, typer.Argument(help="folder of a run, finished or not, as padgs-run names it at its end")]
 MAX_SEED, MAX_THREADS = 2**32 - 1, 1024
@@ -25,16 +25,13 @@ def show(text: str, stream: TextIO | None = None) -> None:
 
 
 def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a command: an error ends it with a line and exit code 1, Ctrl-C with a line and exit code 130."""
+    """Wrap a command: an error ends it with a line and exit code 1, a signal as well."""
 
     @wraps(command)
     def wrapped(**options: Any) -> None:
         try:
-            command(**options)
-            sys.stdout.flush()
-        except KeyboardInterrupt as stopped:
-            show(str(stopped) or "stopped", sys.stderr)
-            raise typer.Exit(INTERRUPTED) from stopped
+            with ending_by_signals():
+                command(**options)
         except (typer.Exit, BrokenPipeError):  # typer ends in silence where the reader of the output has ended
             raise
         except (ValueError, OSError, RuntimeError, MemoryError) as error:

@@ -31,6 +31,7 @@ class Protocol:
     bottom_crop: float = 0.0  # share of the rows at the bottom that is not evaluated (a tripod, a car)
 
     def __post_init__(self) -> None:
+        check(self, f"at least one of {', '.join(METRICS)}", bool, "metrics")
         unknown = [name for name in self.metrics if name not in METRICS]
         if unknown:
             raise ValueError(f"unknown metric {unknown[0]!r}; known: {', '.join(METRICS)}")

@@ -23,7 +23,7 @@ from padgs.multirun.composition import typed_config
 from padgs.results import SMALLEST_STATED, Result
 from padgs.runs.config import RunConfig
 from padgs.runs.console import say
-from padgs.runs.interrupt import Interrupted
+from padgs.runs.interrupt import Interrupted, answer_signals
 from padgs.runs.load import load_run
 from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
 from padgs.runs.smallest import find_smallest
@@ -39,6 +39,7 @@ def job_of_many(composed: DictConfig) -> str:
     Returns:
         Its status, one of `padgs.results.STATUSES` or of `padgs.multirun.board`.
     """
+    answer_signals()  # of a process of its own
     hydra = HydraConfig.get()
     board = Board(Path(hydra.sweep.dir))
     with ExitStack() as stack:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Sequence
 
-from padgs.runs.interrupt import INTERRUPTED
+from padgs.runs.interrupt import ending_by_signals
 
 
 def main() -> None:
-    """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
+    """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 128 + number of the signal that stopped it."""
     arguments = sys.argv[1:]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # schedulers send it; it is no crash
-    try:  # slow modules are imported within, so that Ctrl-C is answered from the beginning
+    advice = f"; to go on: {shlex.join(['padgs-run', *arguments])}"
+    with ending_by_signals(advice):  # slow modules are imported within
         from padgs.multirun.job import exit_on_errors
 
         with exit_on_errors():
@@ -40,12 +39,6 @@ def main() -> None:
                     callback.ended(result)
                     ends = {result.status}
         sys.exit(0 if ends <= {OK} else 1)
-    except KeyboardInterrupt as stopped:
-        from padgs.runs.console import printable
-
-        advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
-        print(printable(advice), file=sys.stderr)
-        sys.exit(INTERRUPTED)
 
 
 def _answer(arguments: Sequence[str]) -> None:

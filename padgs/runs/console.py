@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from padgs.checks import printable
 from padgs.evaluation import BANDS
 from padgs.results import Result
 
@@ -25,16 +26,6 @@ if TYPE_CHECKING:
 def say(console: Console, text: object, style: str = "") -> None:
     """Print lines without wrapping."""
     console.print(Text(printable(str(text)), style), soft_wrap=True)
-
-
-def printable(text: str) -> str:
-    r"""Return a text with escapes for control characters and for code points without encoding.
-
-    >>> printable("caf\u00e9 \x1b[2J \udce9")
-    'café \\x1b[2J \\udce9'
-    """
-    shown = "".join(c if c.isprintable() or c in "\n\t" or ord(c) > 0xFF else f"\\x{ord(c):02x}" for c in text)
-    return shown.encode("utf-8", "backslashreplace").decode()
 
 
 REDRAWS_PER_SECOND = 5

@@ -33,6 +33,7 @@ from padgs.scene import Scene
 from padgs.training.health import Failure, is_out_of_memory, memory_reason, validation_split
 from padgs.training.loop import Record
 from padgs.training.method import Method
+from padgs.training.options import AUTO
 
 MAX_DEPTH_ERROR = 0.5  # AbsRel; more is degenerate
 MIN_THICKNESS = 0.01  # of all surfaces along their thinnest axis, relative to the true one; less is degenerate
@@ -99,9 +100,10 @@ def run(
                 ):
                     for record in method.fit(scene, config.time):
                         progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
-                        line.update(record, _log(config, scene, store, record, method))
+                        probed = _log(config, scene, store, record, method)
                         interrupted = interrupt.requested
-                        ending = stop.requested and not method.ended and method.request_stop(STOP_REQUESTED)
+                        ending = stop.requested and not (method.ended or config.train.refine)  # a candidate of a search
+                        ending = ending and method.request_stop(STOP_REQUESTED)
                         every = config.run.checkpoint_every
                         due = every is not None and record.iteration % every == 0
                         due = due or time.monotonic() - saved_at > config.run.seconds_between_checkpoints
@@ -111,6 +113,7 @@ def run(
                             saved_at, saved = time.monotonic(), progress
                         if interrupted and record.progress < 1:
                             raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
+                        line.update(record, probed)
                     if saved != progress:
                         store.save(method, progress)
                 outcome.result = replace(outcome.result, **_trained(method, scene, progress))
@@ -165,12 +168,12 @@ def load_scene(config: RunConfig, device: torch.device) -> Scene:
 
     Raises:
         DataError: the input cannot be used.
-        ValueError: the stress condition cannot be applied to it, or it has too few views for `smallest=on`.
+        ValueError: the stress condition cannot be applied to it, or it has too few views to set some apart.
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
     scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
     scene = config.stress.apply(scene, config.seed).recentered().to(device)
-    if config.smallest == "on":
+    if config.smallest == "on" or config.budget.stop == AUTO:
         validation_split(scene.train)  # refuses too few views before hours of training
     return scene
 

@@ -1,19 +1,32 @@
 """What no run could do anything sensible with is found when its configuration is composed."""
 
+from dataclasses import fields, is_dataclass
+from typing import get_args, get_origin, get_type_hints
+
 import pytest
 from support.composed import configuration
 
+from padgs.baselines import METHODS
 from padgs.checks import ConfigError
+from padgs.data.synthetic.options import SyntheticOptions
 from padgs.multirun.composition import composing
+from padgs.registry import lookup
+from padgs.runs.config import Settings, config_from_values
 
 MEANINGLESS = {
     "render.near=inf": "render.near is inf; it must be finite",
     "render.low_pass=inf": "it must be finite",
     "render.low_pass=nan": "render.low_pass is nan",
-    "train.max_seconds=-1": "max_seconds is -1.0; it must be > 0",
+    "train.max_seconds=0": "max_seconds is 0.0; it must be > 0",
+    "train.iterations=-5": "train.iterations is -5; it must be from 1 to 100000000",
+    "budget.seconds=1e300": "budget.seconds is 1e+300; it must be from 0 to 100000000",
+    "render.low_pass=1e30": "render.low_pass is 1e+30; it must be from 0 to 10000",
+    "run.threads=100000": "run.threads is 100000; it must be from 1 to 1024",
+    "method=padgs method.offset_rate=[1e30,1]": "method.offset_rate[0] is 1e+30; it must be from",
+    "protocol.paper.metrics=[]": "metrics is (); it must be at least one of psnr",
     "run.checkpoint_seconds=nan": "it must be finite",
-    "run.checkpoint_seconds=-1": "checkpoint_seconds is -1.0; it must be >= 0",
-    "seed=-1": "seed is -1",
+    "run.checkpoint_seconds=-1": "checkpoint_seconds is -1; it must be from 0",
+    "seed=-1": "seed is -1; it must be from 0",
     "method.gradient_threshold=nan": "it must be finite",
     "method.gradient_threshold=-1": "gradient_threshold is -1.0",
     "method=omnigs method.gradient_threshold=-1": "gradient_threshold is -1.0",
@@ -61,3 +74,29 @@ def test_what_makes_no_sense_is_refused_at_composition(line, message):
     with pytest.raises(ConfigError) as refused:
         configuration(line.split())
     assert message in str(refused.value)
+
+
+def numbers(options: object, where: str = ""):
+    """Yield the dotted keys of the numeric fields of a dataclass."""
+    hints = get_type_hints(type(options))
+    for field in fields(options):
+        if is_dataclass(value := getattr(options, field.name)):
+            yield from numbers(value, f"{where}{field.name}.")
+        elif {int, float} & {hints[field.name], *get_args(hints[field.name])}:
+            pair = get_origin(hints[field.name]) is tuple
+            yield f"{where}{field.name}" + "=[1e30,1]" * pair
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_number_has_limits(method):
+    known = [*numbers(Settings()), *numbers(lookup(METHODS, method, "method").Options(), "method.")]
+    known += numbers(SyntheticOptions(), "data.generator.")
+    for key in known:
+        values = {"method": {"name": method}, "protocol": {"paper": {}}}
+        *groups, name = key.partition("=")[0].split(".")
+        place = values
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[name] = [1e30, 1.0] if key.endswith("]") else 1e30
+        with pytest.raises(ConfigError, match=f"{name}.* is 1e.30; it must be from .* to "):
+            config_from_values(values)

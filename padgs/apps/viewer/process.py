@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from padgs.apps.viewer.server import LOCAL, PORT, start_server, viser_module
+from padgs.runs.interrupt import answer_signals
 
 if TYPE_CHECKING:
     from padgs.runs.load import LoadedRun
@@ -36,7 +37,7 @@ def serve(
         ValueError, OSError: from `start_server` or `load_runs`.
         KeyboardInterrupt: on Ctrl-C.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # otherwise libraries report a crash
+    answer_signals()  # also in a child process
     with start_server(host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)
         if browse and server.is_local:

@@ -6,7 +6,9 @@ file, which all versions write. Source: the description of COLMAP's output forma
 
 from __future__ import annotations
 
+import signal
 import struct
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -99,11 +101,13 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
 
 
 def pycolmap_module() -> ModuleType:
-    """Import pycolmap without breaking PNG files of Pillow."""
+    """Import pycolmap without breaking PNG files of Pillow and the handler of SIGTERM."""
     import zlib  # noqa: F401 - first, or pycolmap's deflate symbols replace the system's
 
     import pycolmap
 
+    if threading.current_thread() is threading.main_thread():  # the handler of its library calls SIGTERM a crash
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     return pycolmap
 
 
