@@ -57,8 +57,9 @@ def _stated(xmp: str, name: str) -> str | None:
 
 
 def load_late_chunks(image: Image.Image, data: bytes) -> None:
-    """Decode a PNG that has metadata behind its pixels, which Pillow reads only then."""
-    if image.format == "PNG" and any(kind in data[data.rfind(b"IDAT") :] for kind in (b"eXIf", b"iTXt", b"tEXt")):
+    """Decode a PNG that has EXIF or XMP behind its pixels, which Pillow reads only then."""
+    late = data[data.rfind(b"IDAT") :] if image.format == "PNG" else b""
+    if any(name in late for name in (b"eXIf", b"com.adobe.xmp", b"Raw profile type")):
         image.load()
 
 

@@ -187,7 +187,9 @@ def _is_transparent(image: Image.Image) -> bool:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    """Scale 16-bit masks to 8 bits; Pillow's own conversion would clip them."""
+    """Scale 16-bit masks to 8 bits, which Pillow's own conversion would clip, and resolve transparent palettes."""
+    if image.mode == "P" and "transparency" in image.info:
+        return image.convert("RGBA")
     if not image.mode.startswith("I"):
         return image
     return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))

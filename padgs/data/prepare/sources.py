@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +31,19 @@ from padgs.data.masks import PREVIEW, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+
+
+_STATEMENTS = {"SPHERICAL": 1, "STEREO3D": 1, "DISPLAYMATRIX": 9}  # of a frame -> 32-bit numbers that are read
+_HDR_TRANSFER = {8: "linear", 16: "PQ", 18: "HLG"}  # numbers of ITU-T H.273
+_PROJECTIONS = (
+    "equirectangular",
+    "cubemap",
+    "part of an equirectangular one",
+    "half equirectangular",
+    "rectilinear",
+    "fisheye",
+)
+_ONE_EYE = {0: (1, 1), 1: (1, 2), 2: (2, 1)}  # FFmpeg's stereo layout -> views one above the other, and side by side
 
 
 def is_video(path: Path) -> bool:
@@ -61,32 +75,77 @@ def extract_frames(
 
 
 def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], None]) -> Iterator[NDArray[np.uint8]]:
-    """Yield the sharpest frame [H, W, 3] of every interval."""
+    """Yield the sharpest frame [H, W, 3] of every interval of time that has a frame."""
     try:
-        import imageio.v3 as imageio
+        import av
 
-        meta = imageio.immeta(video, plugin="pyav")
-        rate = float(meta.get("fps") or 30.0)
-        total = round(rate * float(meta.get("duration") or 0.0))
-        interval = max(1, round(rate / per_second))
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for index, frame in enumerate(imageio.imiter(video, plugin="pyav")):
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise DataError(f"{video} holds no video stream; give a stitched 360-degree video")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            rate = float(stream.average_rate or 30)
+            total = stream.frames or round(rate * float((container.duration or 0) / av.time_base))
+            best, best_sharpness, interval, start = None, -1.0, 0, None
+            for index, frame in enumerate(container.decode(stream)):
+                time = index / rate if frame.time is None else frame.time
+                start = time if start is None else start
+                pixels = _panorama_of(frame, video)
                 if index == 0:  # before an hour of decoding
-                    refuse_other_shapes(frame.shape[1], frame.shape[0], video)
-                    refuse_dual_fisheye(frame, video)
+                    refuse_other_shapes(pixels.shape[1], pixels.shape[0], video)
+                    refuse_dual_fisheye(pixels, video)
                 progress(index + 1, max(total, index + 1))
-                yield frame
-
-        decoded = frames()
-        while (best := max(islice(decoded, interval), key=sharpness, default=None)) is not None:
+                now = int((time - start) * per_second + 1e-6)
+                if best is not None and now != interval:
+                    yield best
+                    best, best_sharpness = None, -1.0
+                if (sharp := sharpness(pixels)) > best_sharpness:
+                    best, best_sharpness = pixels, sharp
+                interval = now
+        if best is not None:
             yield best
     except ImportError as error:
-        raise DataError(f"reading {video} needs imageio and PyAV: pip install 'padgs[video]'") from error
+        raise DataError(f"reading {video} needs PyAV: pip install 'padgs[video]'") from error
     except DataError:  # not panoramas
         raise
-    except (OSError, ValueError, RuntimeError, StopIteration) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
+
+
+def _panorama_of(frame: Any, video: Path) -> NDArray[np.uint8]:
+    """Return the pixels of a frame, turned upright and of one eye, as the video says.
+
+    Raises:
+        DataError: the video says that it is mirrored, in another projection, or in colours of HDR.
+    """
+    if getattr(frame, "color_trc", None) in _HDR_TRANSFER:
+        raise DataError(
+            f"{video} is HDR (transfer {_HDR_TRANSFER[frame.color_trc]}); export it in standard dynamic range"
+        )
+    pixels = frame.to_ndarray(format="rgb24")
+    said = {
+        side.type.name: np.frombuffer(bytes(side), np.int32, count=_STATEMENTS[side.type.name])
+        for side in frame.side_data
+        if side.type.name in _STATEMENTS
+    }
+    if "SPHERICAL" in said and (kind := int(said["SPHERICAL"][0])) != 0:
+        kinds = dict(enumerate(_PROJECTIONS))
+        raise DataError(f"{video} says that its projection is {kinds.get(kind, kind)}, not equirectangular; convert it")
+    if "STEREO3D" in said:
+        layout = int(said["STEREO3D"][0])
+        if layout not in _ONE_EYE:
+            raise DataError(f"{video} says that it is stereo of a kind that is not read ({layout}); export one eye")
+        down, across = _ONE_EYE[layout]
+        pixels = pixels[: len(pixels) // down, : pixels.shape[1] // across]
+    if "DISPLAYMATRIX" in said:
+        (a, b), (c, d) = said["DISPLAYMATRIX"].reshape(3, 3)[:2, :2].astype(float)
+        quarters = math.degrees(math.atan2(c, a)) / 90
+        if a * d - b * c <= 0 or abs(quarters - round(quarters)) > 0.01:
+            raise DataError(
+                f"{video} says that it is mirrored or turned by {90 * quarters:g} degrees; export it upright"
+            )
+        pixels = np.rot90(pixels, round(quarters))
+    return np.ascontiguousarray(pixels)
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:

@@ -143,6 +143,8 @@ def digest_of(fingerprint: str, options: PrepareOptions) -> str:
 def _file_digest(path: Path) -> str:
     digest = hashlib.sha256()
     try:
+        if not path.is_file() and path.exists():
+            raise OSError(0, "it is no regular file")
         with open(path, "rb") as file:
             while block := file.read(1 << 20):
                 digest.update(block)

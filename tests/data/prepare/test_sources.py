@@ -2,6 +2,8 @@
 
 import builtins
 import errno
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from PIL import Image
 
 from padgs.data import DataError
 from padgs.data.assemble import PREPARED, SKIPPED
-from padgs.data.prepare.sources import extract_frames, find_source, is_video, sharpness
+from padgs.data.prepare.sources import _panorama_of, extract_frames, find_source, is_video, sharpness
 from padgs.results import CONFIG_NAME, PICTURES
 
 
@@ -116,23 +118,30 @@ def test_a_missing_extra_is_reported(tmp_path, monkeypatch):
     real = builtins.__import__
 
     def refuse(name, *args, **kwargs):
-        if name.startswith("imageio"):
+        if name == "av":
             raise ImportError(name)
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(DataError, match=r"needs imageio and PyAV: pip install 'padgs\[video\]'"):
+    with pytest.raises(DataError, match=r"needs PyAV: pip install 'padgs\[video\]'"):
         extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
 
 
-def write(path, frames):
+def write(path, frames, times=None, turned=0, stereo=None):
+    """Write a video of ten frames a second, or of frames at `times` in tenths of a second."""
     av = pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height = frames[0].shape[1], frames[0].shape[0]
         stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
-        for pixels in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        if turned:
+            stream.set_display_rotation(turned)
+        if stereo:
+            stream.metadata["stereo_mode"] = stereo
+        for index, pixels in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
+            frame.pts = index if times is None else times[index]
+            container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
 
@@ -147,6 +156,57 @@ def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
     for name, index in (("frame_00001.jpg", 3), ("frame_00002.jpg", 16)):
         darkest = np.asarray(Image.open(tmp_path / name)).min()
         assert abs(int(darkest) - (40 + 5 * index)) < 12
+
+
+def test_frames_are_chosen_by_time_at_a_variable_rate(tmp_path):
+    times = [*range(20), *range(20, 40, 5)]  # two seconds of ten frames a second, then two of two
+    write(tmp_path / "a.mp4", [np.full((64, 128, 3), 40 + 5 * time, np.uint8) for time in times], times)
+    assert extract_frames(tmp_path / "a.mp4", tmp_path, 2.0) == 8
+    brightness = [np.asarray(Image.open(tmp_path / f"frame_0000{n}.jpg")).mean() for n in range(1, 9)]
+    assert [int((value - 38) / 25) for value in brightness] == [*range(8)]
+
+
+@pytest.mark.parametrize(
+    ("name", "store", "stated"),
+    [
+        ("a.mp4", lambda pixels: np.rot90(pixels, 2), {"turned": 180}),
+        ("a.mp4", lambda pixels: np.rot90(pixels, -1), {"turned": 90}),
+        ("a.mp4", lambda pixels: np.rot90(pixels, 1), {"turned": -90}),
+        ("a.mkv", lambda pixels: np.concatenate((pixels, 255 - pixels), 0), {"stereo": "top_bottom"}),
+        ("a.mkv", lambda pixels: np.concatenate((pixels, 255 - pixels), 1), {"stereo": "left_right"}),
+    ],
+    ids=["upside down", "turned left", "turned right", "top and bottom", "left and right"],
+)
+def test_frames_are_turned_and_cut_as_the_video_says(name, store, stated, tmp_path):
+    pixels = np.full((64, 128, 3), 200, np.uint8)
+    pixels[32:], pixels[:, :64, 0] = 60, 255
+    write(tmp_path / name, 3 * [store(pixels)], **stated)
+    extract_frames(tmp_path / name, tmp_path, 2.0)
+    assert np.abs(np.asarray(Image.open(tmp_path / "frame_00001.jpg")).astype(int) - pixels).mean() < 2
+
+
+class Side(bytes):
+    type = SimpleNamespace(name="")
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "message"),
+    [
+        ("SPHERICAL", [1], "its projection is cubemap, not equirectangular"),
+        ("STEREO3D", [6], "stereo of a kind that is not read"),
+        ("DISPLAYMATRIX", [65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30], "mirrored or turned by 0 degrees"),
+        ("DISPLAYMATRIX", [46341, -46341, 0, 46341, 46341, 0, 0, 0, 1 << 30], "turned by 45 degrees"),
+    ],
+)
+def test_other_statements_of_videos_are_refused(name, numbers, message):
+    side = Side(np.array(numbers, np.int32).tobytes())
+    side.type = SimpleNamespace(name=name)
+    pixels = np.zeros((8, 16, 3), np.uint8)
+    frame = SimpleNamespace(color_trc=1, side_data=[side], to_ndarray=lambda format: pixels)
+    with pytest.raises(DataError, match=message):
+        _panorama_of(frame, Path("a.mp4"))
+    with pytest.raises(DataError, match=r"a.mp4 is HDR \(transfer PQ\)"):
+        _panorama_of(SimpleNamespace(color_trc=16), Path("a.mp4"))
 
 
 def test_other_aspect_ratios_are_refused_at_the_first_frame(tmp_path):

@@ -1,0 +1,217 @@
+"""Statements of image files about their pixels: read and applied, or refused with a remedy."""
+
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageCms
+from support.fixtures import World, write_colmap_text
+
+from padgs.data import DataError, load
+from padgs.data.images import decode, inspect
+from padgs.data.prepare.sources import find_source
+
+XMP = b"XML:com.adobe.xmp\0\0\0\0\0"  # begins the chunk iTXt of a PNG
+PIXELS = np.random.default_rng(3).integers(0, 256, (64, 128, 3), dtype=np.uint8)
+PANORAMA = Image.fromarray(PIXELS)
+GPANO = {
+    "ProjectionType": "equirectangular",
+    "FullPanoWidthPixels": 160,
+    "FullPanoHeightPixels": 80,
+    "CroppedAreaImageWidthPixels": 128,
+    "CroppedAreaImageHeightPixels": 64,
+    "CroppedAreaLeftPixels": 20,
+    "CroppedAreaTopPixels": 6,
+}
+
+
+def xmp(elements: bool = False, **properties: object) -> bytes:
+    if elements:
+        body = ">" + "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in properties.items())
+    else:
+        body = "".join(f' GPano:{name}="{value}"' for name, value in properties.items()) + ">"
+    return f"<x:xmpmeta><rdf:RDF><rdf:Description{body}</rdf:Description></rdf:RDF></x:xmpmeta>".encode()
+
+
+def png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def with_chunk(path: Path, image: Image.Image, chunk: bytes, before: bytes = b"IDAT") -> Path:
+    """Save a PNG with a chunk added before another one."""
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    place = file.getvalue().index(before) - 4
+    path.write_bytes(file.getvalue()[:place] + chunk + file.getvalue()[place:])
+    return path
+
+
+@pytest.mark.parametrize("elements", [False, True])
+@pytest.mark.parametrize("extension", ["jpg", "webp", "tif", "png", "late.png"])
+def test_a_part_of_a_panorama_is_padded(extension, elements, tmp_path):
+    path, packet = tmp_path / f"a.{extension}", xmp(elements, **GPANO)
+    if "png" in extension:
+        text = png_chunk(b"iTXt", XMP + packet)
+        with_chunk(path, PANORAMA, text, before=b"IEND" if "late" in extension else b"IDAT")
+    elif extension == "tif":
+        PANORAMA.save(path, tiffinfo={700: packet})
+    else:
+        PANORAMA.save(
+            path, xmp=packet, **({"lossless": True} if extension == "webp" else {"quality": 95, "subsampling": 0})
+        )
+    found, pixels = inspect(path), decode(path)
+    assert (found.width, found.height) == (160, 80) and pixels.shape == (80, 160, 3)
+    inside = pixels[6:70, 20:148].astype(int)
+    assert np.abs(inside - PIXELS).mean() < (20 if extension == "jpg" else 0.1)
+    assert pixels.sum() == inside.sum()
+
+
+def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_part(tmp_path):
+    larger = {name: value if isinstance(value, str) else 10 * value for name, value in GPANO.items()}
+    PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**larger))
+    found = inspect(tmp_path / "a.jpg")
+    assert found.crop is not None and (found.crop.left, found.crop.top, found.width) == (20, 6, 160)
+    whole = {"FullPanoWidthPixels": 1024, "FullPanoHeightPixels": 512}
+    PANORAMA.save(
+        tmp_path / "a.jpg",
+        xmp=xmp(**whole, CroppedAreaImageWidthPixels=1024, CroppedAreaImageHeightPixels=512, CroppedAreaLeftPixels=0),
+    )
+    found = inspect(tmp_path / "a.jpg")
+    assert found.crop is None and (found.width, found.height) == (128, 64)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ProjectionType": "cylindrical"}, "says that its projection is 'cylindrical', not equirectangular"),
+        ({"CroppedAreaLeftPixels": 100}, "contradicts itself: it is 128x64 and says .*CroppedAreaLeftPixels 100"),
+        ({"FullPanoWidthPixels": "wide"}, "contradicts itself"),
+        ({"CroppedAreaImageWidthPixels": 0}, "contradicts itself"),
+        ({"CroppedAreaImageHeightPixels": 20}, "contradicts itself"),
+        ({"FullPanoHeightPixels": 79}, "is 160x79, which is not 2:1"),
+        ({"StereoMode": "top-bottom"}, r"says that it is stereo \(top-bottom\)"),
+        ({"Orientation": 6}, "carries XMP orientation 6"),
+    ],
+)
+def test_other_projections_contradictions_and_stereo_are_refused(changes, message, tmp_path):
+    PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**GPANO | changes))
+    with pytest.raises(DataError, match=f"a.jpg {message}"):
+        inspect(tmp_path / "a.jpg")
+
+
+def test_what_a_part_does_not_show_is_masked(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    first, second = world.names[:2]
+    path = tmp_path / "images" / f"{first}.png"
+    part = Image.fromarray(world.images[0][8:24, 16:48])
+    packet = xmp(FullPanoWidthPixels=64, FullPanoHeightPixels=32, CroppedAreaLeftPixels=16, CroppedAreaTopPixels=8)
+    with_chunk(path, part, png_chunk(b"iTXt", XMP + packet))
+    for mask in ("auto", "none"):
+        scene = load(tmp_path, mask=mask)
+        views = {view.name: view for view in (*scene.train, *scene.test)}
+        weights = views[first].mask()
+        assert weights is not None and weights[8:24, 16:48].min() == 1 and weights.sum() == 16 * 32
+        assert views[second].mask() is None
+        assert any(f"the rest is masked: {first}.png" in note for note in scene.notes)
+    assert load(tmp_path, mask="rows:12/32").train[0].mask().sum() == 4 * 32
+    half = load(tmp_path, width=32)
+    assert half.train[0].mask().sum() == 8 * 16
+    source = find_source(tmp_path / "images", "auto")
+    assert source.masks[f"{first}.png"]().sum() == 16 * 32 and "the rest is masked" in source.notes[0]
+
+
+def test_a_tilted_camera_is_noted(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    packet = xmp(PosePitchDegrees=0, PoseRollDegrees="-3.5")
+    image = Image.fromarray(world.images[0])
+    with_chunk(
+        tmp_path / "images" / f"{world.names[0]}.png",
+        image,
+        png_chunk(b"iTXt", XMP + packet),
+    )
+    assert any(r"tilted, such as pano_00.png (roll -3.5 degrees)" in note for note in load(tmp_path).notes)
+
+
+def test_colours_are_converted_to_srgb(tmp_path):
+    grey = Image.fromarray(np.full((64, 128, 3), 55, np.uint8))
+    linear = with_chunk(tmp_path / "linear.png", grey, png_chunk(b"gAMA", struct.pack(">I", 100_000)))
+    assert inspect(linear).converted and np.unique(decode(linear)).tolist() == [128]  # 55 / 255 of the light
+    usual = with_chunk(tmp_path / "usual.png", grey, png_chunk(b"gAMA", struct.pack(">I", 45_455)))
+    assert not inspect(usual).converted and np.unique(decode(usual)).tolist() == [55]
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    PANORAMA.save(tmp_path / "srgb.png", icc_profile=profile)
+    assert not inspect(tmp_path / "srgb.png").converted and np.array_equal(decode(tmp_path / "srgb.png"), PIXELS)
+    swapped = profile.replace(b"rXYZ", b"tXYZ").replace(b"gXYZ", b"rXYZ").replace(b"tXYZ", b"gXYZ")
+    PANORAMA.save(tmp_path / "swapped.png", icc_profile=swapped)  # with the primaries of red and green exchanged
+    assert inspect(tmp_path / "swapped.png").converted
+    assert np.abs(decode(tmp_path / "swapped.png").astype(int) - PIXELS[..., [1, 0, 2]]).mean() < 3
+    assert np.array_equal(decode(tmp_path / "swapped.png", "L")[..., 0], np.asarray(PANORAMA.convert("L")))
+
+
+@pytest.mark.parametrize(
+    ("chunk", "message"),
+    [
+        (png_chunk(b"cICP", bytes((9, 16, 0, 1))), r"colours of video or HDR \(cICP \[9, 16, 0, 1\]\)"),
+        (png_chunk(b"cHRM", struct.pack(">8I", *(31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000))), "primaries"),
+        (png_chunk(b"gAMA", struct.pack(">I", 1)), "gamma 1e-05"),
+        (png_chunk(b"iCCP", b"x\0\0" + zlib.compress(b"no profile" * 20)), "an ICC profile that cannot be applied"),
+    ],
+)
+def test_colours_of_other_kinds_are_refused(chunk, message, tmp_path):
+    with pytest.raises(DataError, match=f"a.png .*{message}.*8-bit sRGB"):
+        inspect(with_chunk(tmp_path / "a.png", PANORAMA, chunk))
+
+
+@pytest.mark.parametrize("extension", ["png", "webp", "tif"])
+def test_several_pictures_are_refused(extension, tmp_path):
+    PANORAMA.save(tmp_path / f"a.{extension}", save_all=True, append_images=[Image.fromarray(255 - PIXELS)])
+    with pytest.raises(DataError, match=f"a.{extension} holds 2 pictures .*save the one that is meant"):
+        inspect(tmp_path / f"a.{extension}")
+
+
+@pytest.mark.parametrize("kind", ["palette", "colour key", "grey mask"])
+def test_transparency_without_an_alpha_channel_is_refused(kind, tmp_path):
+    image = PANORAMA.quantize(16) if kind == "palette" else PANORAMA.convert("L") if "mask" in kind else PANORAMA
+    key = {"palette": bytes((255, 0)), "colour key": tuple(map(int, PIXELS[3, 3])), "grey mask": 77}[kind]
+    image.save(tmp_path / "a.png", transparency=key)
+    with pytest.raises(DataError, match="a.png has transparent pixels"):
+        inspect(tmp_path / "a.png", mask="mask" in kind)
+    if kind == "palette":
+        image.save(tmp_path / "a.png", transparency=bytes((255, 255)))  # which no pixel uses
+        assert np.array_equal(decode(tmp_path / "a.png"), np.asarray(image.convert("RGB")))
+
+
+@pytest.mark.parametrize(
+    ("image", "as_panorama", "as_mask"),
+    [
+        (PANORAMA.convert("LAB"), "is LAB; convert it to RGB", "has pixels of type LAB; save masks as grey"),
+        (PANORAMA.convert("CMYK"), "is CMYK; convert it to RGB", "has pixels of type CMYK"),
+        (PANORAMA.convert("F"), "has 16 bits or more", "has pixels of type F"),
+        (PANORAMA.convert("I"), "has 16 bits or more", "has pixels of type I"),
+    ],
+    ids=["LAB", "CMYK", "F", "I"],
+)
+def test_other_kinds_of_pixels_are_refused_by_their_name(image, as_panorama, as_mask, tmp_path):
+    image.save(tmp_path / "a.tif")
+    for message, mask in ((as_panorama, False), (as_mask, True)):
+        with pytest.raises(DataError, match=f"a.tif {message}"):
+            inspect(tmp_path / "a.tif", mask=mask)
+
+
+@pytest.mark.parametrize("before", [b"IDAT", b"IEND"])
+def test_long_texts_in_a_file_name_the_file(before, tmp_path):
+    text = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(3 << 20)))
+    path = with_chunk(tmp_path / "a.png", PANORAMA, text, before)
+    for look in (inspect, decode) if before == b"IDAT" else (decode,):
+        with pytest.raises(DataError, match=r"a.png .*[Dd]ecompressed data too large"):
+            look(path)
+
+
+@pytest.mark.parametrize(("size", "eyes"), [((64, 64), "one above the other"), ((256, 64), "side by side")])
+def test_sizes_of_stereo_pairs_have_a_hint(size, eyes, tmp_path):
+    PANORAMA.resize(size).save(tmp_path / "a.png")
+    with pytest.raises(DataError, match=rf"a.png is .*not 2:1.*two panoramas {eyes} \(stereo\), cut out one"):
+        inspect(tmp_path / "a.png")
