@@ -44,12 +44,12 @@ def synchronise(device: Device = "cpu") -> None:
 
 
 def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
-    """Return the value of `work()` and its wall time in seconds, including the work queued on the device."""
+    """Return the value of `work()` and its seconds: CPU time of the process, or on a GPU wall time of queued work."""
     synchronise(device)
     lap = Lap()
     value = work()
     synchronise(device)
-    return value, lap.seconds()[0]
+    return value, lap.seconds()[torch.device(device).type == "cpu"]
 
 
 @contextmanager
@@ -78,11 +78,14 @@ def measure(
         raise ValueError(f"repeats is {repeats} and warm_up {warm_up}; they must be at least 1 and 0")
     for _ in range(warm_up):
         work()
-    wall, cpu = [], []
+    laps = []
     for _ in range(repeats):
-        cpu_start = time.process_time()
-        wall.append(timed(work, device)[1])
-        cpu.append(time.process_time() - cpu_start)
+        synchronise(device)
+        lap = Lap()
+        work()
+        synchronise(device)
+        laps.append(lap.seconds())
+    wall, cpu = map(list, zip(*laps, strict=True))
     return {"repeats": repeats, "wall": summary(wall), "cpu": summary(cpu)}
 
 

@@ -71,7 +71,9 @@ class Result:
     reason: str = ""  # why a run failed
     ended: str = ""  # why the run skipped part of its schedule, see `padgs.training.health`
     scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> scores
-    timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
+    timing: dict[str, float] = field(
+        default_factory=dict
+    )  # train_seconds, cpu_seconds, render_ms_min, render_ms_median
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
     model_bytes: int = 0
     peak_memory_bytes: int = 0  # of the process, while training

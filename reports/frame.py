@@ -193,6 +193,12 @@ def _flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any
             yield f"{where}{key}", value
 
 
+def _training_seconds(result: Result) -> float | None:
+    """Return the training time of the device that trained: CPU time of the process, or wall time on a GPU."""
+    wall = result.timing.get("train_seconds")
+    return wall if result.machine.get("gpu") else result.timing.get("cpu_seconds", wall)
+
+
 FACTS: Mapping[str, Callable[[Result], Any]] = {
     **{
         name: attrgetter(name)
@@ -218,9 +224,10 @@ NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "iterations_done": lambda result: result.iterations_done,
     "images": images_seen,
     "rate_factor": _factor,
-    "train_seconds": lambda result: result.timing.get("train_seconds"),
+    "train_seconds": _training_seconds,
+    "wall_seconds": lambda result: result.timing.get("train_seconds"),
     "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of the process, while training
-    "frame_ms": lambda result: result.timing.get("render_ms_median"),  # over the test views, decoding included
+    "frame_ms": lambda result: result.timing.get("render_ms_median"),  # of repeats, decoding included
     "anchors": lambda result: result.counts.get("anchors"),
     "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before training
     "gaussians": lambda result: result.counts.get("gaussians"),

@@ -42,9 +42,9 @@ def test_summary_of_known_numbers():
     assert clock.summary([2.0]) == {"median": 2.0, "p95": 2.0, "min": 2.0}
 
 
-def test_timed_returns_the_value():
-    value, seconds = clock.timed(lambda: time.sleep(0.01) or "done")
-    assert value == "done" and 0.01 <= seconds < 0.5
+def test_timed_returns_the_value_and_cpu_time():
+    value, seconds = clock.timed(lambda: time.sleep(0.1) or "done")
+    assert value == "done" and 0 <= seconds < 0.05
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak can be reset on Linux only")

@@ -60,7 +60,7 @@ def scene(tmp_path_factory) -> Scene:
 
 @pytest.mark.parametrize("setting", METHODS)
 def test_methods_train_and_render_on_the_device_of_the_scene(setting, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(scoring, "FRAMES", 1)
+    monkeypatch.setattr(scoring, "REPEATS", 1)
     overrides, waits_each = METHODS[setting]
     common = f"train.check_every={CHECK_EVERY}", "train.learning_rates=published", "render.backend=torch"
     config = composed(f"method={setting}", *overrides, *common)

@@ -24,6 +24,12 @@ def test_a_row_a_run_with_its_numbers_conditions_and_keys():
     assert made["paper/psnr"].isna().tolist() == [False, True]
 
 
+def test_training_time_is_cpu_time_unless_a_gpu_trained():
+    timing = {"train_seconds": 90.0, "cpu_seconds": 60.0}
+    runs = [Run(replace(result("full"), timing=timing, machine={"gpu": gpu})) for gpu in (None, "H100")]
+    assert frame(runs)["train_seconds"].tolist() == [60, 90] and frame(runs)["wall_seconds"].tolist() == [90, 90]
+
+
 def test_what_was_logged_last_is_a_number_of_the_run():
     log = {"iteration": [5, 9], "seconds": [1.0, 2.0], "psnr": [20.0, 21.0], "polar_transmittance": [0.2, 0.1]}
     found = frame([Run(small(25.0), log), Run(small(26.0))])["polar_transmittance"]

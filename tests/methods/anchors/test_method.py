@@ -84,15 +84,16 @@ def test_resumed_run_is_bit_identical(long_run):
     assert_same_but_time(resumed.state(), whole.state())
 
 
-def test_training_is_invariant_to_world_units():
-    options = replace(EAGER, voxel_size="auto", voxel_pixels=3.0, coarsest=4, refinement=2, offset_rate_unit="scene")
-    (small, before), (large, after) = trained(14, options=options), trained(14, scale=100.0, options=options)
+@pytest.mark.parametrize("scale", [100.0, 2.0**10, 2.0**-10])
+def test_training_is_invariant_to_world_units(scale):
+    options = replace(EAGER, voxel_size="auto", voxel_pixels=3.0, coarsest=4, refinement=2)
+    (small, before), (large, after) = trained(14, options=options), trained(14, scale=scale, options=options)
     assert [r.counts for r in before] == [r.counts for r in after]
     assert before[-1].counts["anchors"] > before[0].counts["anchors"]
     assert [r.loss for r in after] == pytest.approx([r.loss for r in before], rel=1e-3)
-    view, far = scene().test[0], scene(100.0).test[0]
+    view, far = scene().test[0], scene(scale).test[0]
     assert (small.render(view).image - large.render(far).image).abs().max() < 0.02
-    assert torch.allclose(100 * small.render(view).depth, large.render(far).depth, rtol=0.05)
+    assert torch.allclose(scale * small.render(view).depth, large.render(far).depth, rtol=0.05)
 
 
 def test_size_counts_parameters_and_bytes(long_run):
@@ -112,9 +113,10 @@ def test_state_of_other_options_is_refused(long_run):
 
 def test_published_learning_rates():
     model, world = PaDGS.from_scene(scene()), scene()
-    groups = {g.name: g for g in LearningRates().groups(model, world.extent, 30_000)}
+    groups = {g.name: g for g in LearningRates().groups(model, world.extent / world.scale, 30_000)}
+    extent = world.extent / world.scale
     ends = {
-        "offsets": (0.01 * world.extent, 0.0001 * world.extent),
+        "offsets": (0.02 * extent, 0.0002 * extent),
         "features": (0.0075, 0.0075),
         "log_scales": (0.007, 0.007),
         "opacity": (0.002, 2e-5),
@@ -131,9 +133,9 @@ def test_published_learning_rates():
 def test_a_single_camera_can_still_place_gaussians():
     world = scene()
     alone = replace(world, train=world.train[:1])
-    method = PaDGSMethod(replace(EAGER, offset_rate_unit="scene"), TORCH)
+    method = PaDGSMethod(EAGER, TORCH)
     next(method.fit(alone, Budget(100)))
-    assert method.model.groups()[0].learning_rate(0) == pytest.approx(0.01 * EAGER.min_extent)
+    assert method.model.groups()[0].learning_rate(0) == pytest.approx(0.02 * EAGER.min_extent)
 
 
 @pytest.mark.parametrize("wrong", [{"omega_axis": "z"}, {"coarsest": 7}, {"offset_rate_unit": "m"}])
