@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,7 +63,12 @@ def footprint_error(projection: str, sigma: float, latitude: float) -> float:
     cosine = directions @ gaussian.means[0]
     scale = gaussian.scales[0, 0]
     truth = torch.where(cosine > 0, torch.exp(-0.5 * (1 - cosine**2) / scale**2), 0.0)
-    footprint = _FOOTPRINTS[projection](gaussian, panorama, directions)
+    if projection == "cubemap":
+        footprint = _on_faces(gaussian, panorama, directions)
+    else:
+        rows, columns = torch.meshgrid(torch.arange(panorama.height), torch.arange(panorama.width), indexing="ij")
+        pose = torch.eye(4, dtype=torch.float64)
+        footprint = _values(gaussian, pose, panorama, projection, rows.flatten(), columns.flatten()).view(rows.shape)
     area = torch.cos(row_latitudes(panorama.height, dtype=torch.float64))[:, None]
     return ((area * (footprint - truth).abs()).sum() / (area * truth).sum()).item()
 
@@ -75,15 +79,6 @@ def _round(sigma: float, latitude: float) -> Gaussians:
     one = torch.ones(1, dtype=torch.float64)
     scales = torch.full((1, 3), math.radians(sigma), dtype=torch.float64)
     return Gaussians(mean, torch.eye(4, dtype=torch.float64)[:1], scales, one, torch.ones_like(mean))
-
-
-def _on_panorama(projection: str) -> Callable[[Gaussians, Panorama, Tensor], Tensor]:
-    def footprint(gaussian: Gaussians, panorama: Panorama, _directions: Tensor) -> Tensor:
-        rows, columns = torch.meshgrid(torch.arange(panorama.height), torch.arange(panorama.width), indexing="ij")
-        values = _values(gaussian, torch.eye(4).double(), panorama, projection, rows.flatten(), columns.flatten())
-        return values.view(panorama.height, panorama.width)
-
-    return footprint
 
 
 def _on_faces(gaussian: Gaussians, panorama: Panorama, directions: Tensor) -> Tensor:
@@ -116,14 +111,6 @@ def _values(
         return torch.zeros(len(rows), dtype=torch.float64)
     q, acts = footprints.squared_distance(torch.tensor([0]), rows, columns)
     return torch.where(acts, torch.exp(-0.5 * q), 0.0)[:, 0]
-
-
-_FOOTPRINTS = {
-    "erp": _on_panorama("erp"),
-    "tangent": _on_panorama("tangent"),
-    "ray": _on_panorama("ray"),
-    "cubemap": _on_faces,
-}
 
 
 def markdown(errors: dict[str, list[list[float]]]) -> str:

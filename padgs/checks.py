@@ -177,11 +177,10 @@ def install_command(extra: str) -> str:
     return shlex.join([sys.executable, "-m", "pip", "install", f"padgs[{extra}]"])
 
 
-def printable(text: str) -> str:
-    r"""Return a text with escapes for control characters and for code points without encoding.
+def printable(text: str, kept: str = "\n\t") -> str:
+    r"""Return a text with escapes for control characters, also those of bidirectional text, and for lone surrogates.
 
-    >>> printable("caf\u00e9 \x1b[2J \udce9")
-    'café \\x1b[2J \\udce9'
+    >>> printable("caf\u00e9 \x1b[2J \udce9 \u202e")
+    'café \\x1b[2J \\udce9 \\u202e'
     """
-    shown = "".join(c if c.isprintable() or c in "\n\t" or ord(c) > 0xFF else f"\\x{ord(c):02x}" for c in text)
-    return shown.encode("utf-8", "backslashreplace").decode()
+    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)

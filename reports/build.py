@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports import REPORTS, methods, published
@@ -16,9 +15,8 @@ from padgs.reports.measures import Measure
 from padgs.reports.published import AVERAGE, Place, Published
 from padgs.reports.selection import RunSet, experiment_of, one_setting, refuse_differences, settings
 from padgs.reports.significance import (
-    better_rows,
+    SEEDS,
     mean_cell,
-    numbers_of,
     over_scenes,
     over_seeds,
     places,
@@ -121,8 +119,6 @@ class _Builder:
                 cells[value] = unrank(ours) if value in not_ranked else ours
             heading = f"{methods.name(method)}, {title}" if spec.difference else title
             yield Block(heading, self._rows(place, titles, cells))
-        if spec.effects:
-            yield Block(f"Effects, {title}", tuple(self._effects(runs)), signed=True)
 
     def _columns(self) -> tuple[Column, ...]:
         found = [Column("rank", 0)] if self.spec.by_rank else []
@@ -186,7 +182,8 @@ class _Builder:
         ]
         found.sort(key=lambda row: (row[1][0].value is None, -(row[1][0].value or 0.0)))
         cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
-        shared = places(cells, self.measures[0].column)
+        separable = all(cell.count >= SEEDS for cell in cells.values())
+        shared = places(cells, self.measures[0].column) if separable else []
         ranks = {i: Cell(1 + sum(map(len, shared[:place]))) for place, rows in enumerate(shared) for i in rows}
         return tuple(Row(title, (ranks.get(i, Cell()), *row)) for i, (title, row) in enumerate(found))
 
@@ -195,16 +192,6 @@ class _Builder:
             for index, seed, run in one.runs[["seed", "run"]].itertuples():
                 title = ", ".join([one.preset, *one.apart, f"seed {seed}", run.rpartition("_")[2]])
                 yield Row(title, tuple(over_seeds(runs.loc[[index]], self.measures)))
-
-    def _effects(self, runs: DataFrame) -> Iterator[Row]:
-        """Yield linear combinations of the rows, taken within each seed."""
-        (titles,) = self.spec.titles.values()
-        groups = (runs.loc[runs[self.spec.rows] == value] for value in titles)
-        by_seed = [numbers_of(own, self.measures).set_axis(own.loc[own["ok"], "seed"]) for own in groups]
-        for title, weights in self.spec.effects.items():
-            first, *others = (weight * numbers for weight, numbers in zip(weights, by_seed, strict=True))
-            sums = sum(others, first)
-            yield Row(title, tuple(mean_cell(sums[column].dropna().tolist()) for column in sums))
 
 
 class _Pivot(_Builder):
@@ -219,7 +206,7 @@ class _Pivot(_Builder):
             refuse_mixture(runs, self.request, title, spec.conditions)
             self.shown[title] = runs
             add = self._factors if spec.pivot == ("iterations",) else self._lengths
-            blocks += add(title, runs, keys, notes)
+            blocks += add(title, runs, keys)
         lengths = [f"{key[-1]} iterations" for key in keys]
         headings = [
             ", ".join([words, *(RATES[rates] for rates in key[:-1])]) for key, words in zip(keys, lengths, strict=True)
@@ -243,7 +230,7 @@ class _Pivot(_Builder):
             found.setdefault(row, {})[tuple(key)] = over_seeds(own, self.measures)[0], own
         return found
 
-    def _factors(self, title: str, runs: DataFrame, keys: Sequence[Any], notes: list[str]) -> list[Block]:
+    def _factors(self, title: str, runs: DataFrame, keys: Sequence[Any]) -> list[Block]:
         """Return a block for each method, and one with the loss by the law."""
         blocks, losses = [], []
         for preset in methods.ordered(runs["preset"]):
@@ -265,55 +252,13 @@ class _Pivot(_Builder):
         ours, others = (factors[f][1].query("ok").set_index("seed")[column].astype(float) for f in (near, best))
         return mean_cell((ours - others).dropna().tolist())
 
-    def _lengths(self, title: str, runs: DataFrame, keys: Sequence[Any], notes: list[str]) -> list[Block]:
-        """Return a block of methods, and Kendall's rank correlation (tau-b) with the longest training."""
+    def _lengths(self, title: str, runs: DataFrame, keys: Sequence[Any]) -> list[Block]:
         cells = self._cells(runs, title, "preset", *self.spec.pivot)
-        cells = {preset: {key: cell for key, (cell, _) in cells[preset].items()} for preset in methods.ordered(cells)}
-        rows = (Row(methods.title(of), tuple(own.get(key, Cell()) for key in keys)) for of, own in cells.items())
-        correlations = []
-        for key in keys:
-            longest = self._longest(cells, key[0])
-            both = pd.DataFrame(
-                {at: {of: own[at].value for of, own in cells.items() if at in own} for at in {key, longest}},
-                dtype=float,
-            ).dropna()
-            known = key in both and len(both) > 1
-            correlations.append(Cell(float(both[key].corr(both[longest], method="kendall"))) if known else Cell())
-        notes += [f"{title}, {note}" for rates in RATES if (note := self._earliest(cells, rates))]
-        correlation = Row("Kendall's rank correlation", tuple(correlations))
-        order = Block(f"Order beside that after the longest training, {title}", (correlation,), signed=True)
-        return [Block(title, tuple(rows)), order]
-
-    @staticmethod
-    def _longest(cells: Mapping[str, Mapping[Any, Cell]], rates: str) -> tuple[str, int]:
-        """Return the key of the longest training, at best with the same rates: after 30 000 iterations both are one."""
-        return max((key for own in cells.values() for key in own), key=lambda key: (key[1], key[0] == rates))
-
-    def _earliest(self, cells: Mapping[str, Mapping[Any, Cell]], rates: str) -> str:
-        """Say from which length on methods have the order of the longest, where seeds separate them."""
-        lengths = sorted({n for own in cells.values() for of, n in own if of == rates}, reverse=True)
-        if not lengths:
-            return ""
-        end = self._longest(cells, rates)
-        longest = {of: own[end] for of, own in cells.items() if end in own and own[end].value is not None}
-        names, since = list(longest), None
-        better = better_rows(dict(enumerate(longest.values())), self.measures[0].column)
-        pairs = [(names[i], names[j]) for i, of in better.items() for j in of]  # worse, better
-        for n in lengths:
-            here = {of: own[rates, n].value for of, own in cells.items() if (rates, n) in own}
-            values = [(here.get(worse), here.get(better)) for worse, better in pairs]
-            if any(low is not None and high is not None and low >= high for low, high in values):
-                break
-            since = n
-        if not pairs:
-            return f"{RATES[rates]}: seeds separate nothing after the longest."
-        if since is None:
-            return f"{RATES[rates]}: no length has the order of the longest."
-        if any(cell.count > 1 for cell in longest.values()):
-            return (
-                f"{RATES[rates]}: from {since} iterations on, all that seeds separate after the longest has its order."
-            )
-        return f"{RATES[rates]}: from {since} iterations on, the order is that of the longest (one seed each)."
+        rows = (
+            Row(methods.title(preset), tuple(cells[preset].get(key, (Cell(),))[0] for key in keys))
+            for preset in methods.ordered(cells)
+        )
+        return [Block(title, tuple(rows))]
 
 
 def _is_psnr(measure: Measure) -> bool:

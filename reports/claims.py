@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import yaml
-from pandas import DataFrame, concat
+from pandas import DataFrame
 
 from padgs.reports import REPORTS, methods, published
-from padgs.reports.conditions import refuse_mixture
-from padgs.reports.frame import CONFIG, grouped
+from padgs.reports.conditions import PUBLISHED_WIDTH, refuse_mixture
+from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, grouped
 from padgs.reports.measures import COSTS, Measure, metric
 from padgs.reports.published import DATASETS, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import CONFIDENCE
 from padgs.reports.table import MISSING
-from padgs.reports.writers import Page
+from padgs.reports.writers import Page, markdown_text
 from padgs.results import higher_is_better
 
 HOLDS, FAILS, MIXED = "holds", "does not hold", "depends on the scene"
+NOT_REPRODUCED = "not reproduced"  # at sizes or lengths that are not the paper's
 UNDECIDED, UNMEASURED = "undecided", "not measured"
-LEAST_SCENES = 3  # from which on scenes are the units of the test; seeds otherwise
+LEAST_SEEDS = 2  # of both sides, for a scene to be tested
+OURS = "padgs"  # source of claims that are not the paper's
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class Claim:
     metric: str
     ours: Any
     others: Any
+    required: tuple[str, ...] = ()
     scenes: str = ""
     within: tuple[str, ...] = ()
     published: Sequence[tuple[int, str, str]] = ()
@@ -97,19 +101,23 @@ class Claim:
 class Evidence:
     """A verdict and its numbers. An advantage is positive where the claim is right."""
 
-    verdict: str
-    pairs: DataFrame  # columns scene, seed, rival, advantage
-    interval: tuple[float, float] | None = None  # of the mean advantage, see `CONFIDENCE`; None for a single unit
+    claim: Claim
+    scenes: DataFrame  # a row a scene, see `measured`
+    p: float = math.nan  # of the paired test over scenes; NaN without one
+    verdict: str = UNMEASURED
 
     @property
-    def by_scene(self) -> Any:
-        """Mean advantage on each scene, as a series."""
-        return self.pairs.groupby("scene")["advantage"].mean()
+    def tested(self) -> DataFrame:
+        """Scenes on which both sides have enough seeds."""
+        return self.scenes.loc[self.scenes["tested"]] if len(self.scenes) else self.scenes
 
     @property
-    def units(self) -> Any:
-        """Advantages that are tested: of scenes, or of seeds if there are few scenes."""
-        return self.by_scene if len(self.by_scene) >= LEAST_SCENES else self.pairs["advantage"]
+    def interval(self) -> tuple[float, float] | None:
+        """Interval of the mean advantage over the tested scenes; None for fewer than two."""
+        if len(self.tested) < 2:
+            return None
+        found = _test(self.tested["advantage"]).confidence_interval(CONFIDENCE)
+        return float(found.low), float(found.high)
 
 
 def load() -> list[Claim]:
@@ -117,31 +125,49 @@ def load() -> list[Claim]:
     return [Claim(**entry) for entry in yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text("utf-8"))]
 
 
-def evaluate(claim: Claim, run_set: RunSet) -> Evidence:
-    """Test whether the mean advantage differs from zero, by a paired t-test on scenes, or on seeds of few scenes.
+def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
+    """Test whether the mean advantages differ from zero: paired t-tests on the scenes' means over seeds, with Holm's
+    correction for all claims.
 
-    A claim holds (does not hold) if the mean is significantly positive (negative) and so is every scene; it depends on
-    the scene if their means have different signs.
-    The level is divided by the number of rivals (Bonferroni), because the best rival of many is partly lucky.
+    A claim holds (is not reproduced) if the mean is significantly positive (negative), and every scene is likewise.
 
     Raises:
         ReportError: runs must not be compared, or are mixed in a cell.
     """
+    found = [Evidence(claim, measured(claim, run_set)) for claim in claims]
+    found = [replace(one, p=float(_test(one.tested["advantage"]).pvalue)) if one.interval else one for one in found]
+    tested = sorted((one.p, index) for index, one in enumerate(found) if not math.isnan(one.p))
+    adjusted = 0.0
+    for rank, (p, index) in enumerate(tested):
+        adjusted = max(adjusted, min(1.0, (len(tested) - rank) * p))
+        found[index] = replace(found[index], p=adjusted)
+    return [replace(one, verdict=_verdict(one)) for one in found]
+
+
+def _test(advantages: Any) -> Any:
     from scipy.stats import ttest_rel
 
-    found = list(_pairs(claim, run_set))
-    if not found:
-        return Evidence(UNMEASURED, DataFrame())
-    evidence = Evidence(UNDECIDED, concat([own for own, _ in found], ignore_index=True))
-    units, by_scene = evidence.units, evidence.by_scene
-    if len(units) < 2:
-        return evidence
-    level = (1 - CONFIDENCE) / max(rivals for _, rivals in found)
-    interval = ttest_rel(units, [0.0] * len(units)).confidence_interval(1 - level)
-    low, high = float(interval.low), float(interval.high)
-    agree = (by_scene > 0).all() or (by_scene < 0).all()
-    verdict = MIXED if not agree else HOLDS if low > 0 else FAILS if high < 0 else UNDECIDED
-    return replace(evidence, verdict=verdict, interval=(low, high))
+    return ttest_rel(advantages, [0.0] * len(advantages))
+
+
+def _verdict(evidence: Evidence) -> str:
+    if evidence.scenes.empty:
+        return UNMEASURED
+    advantages = evidence.tested["advantage"]
+    if len(advantages) < 2:
+        return UNDECIDED
+    if (advantages > 0).any() and (advantages < 0).any():
+        return MIXED
+    if not evidence.p < 1 - CONFIDENCE:
+        return UNDECIDED
+    if advantages.mean() > 0:
+        return HOLDS
+    as_published = evidence.claim.source == OURS or evidence.tested["as published"].all()
+    return FAILS if as_published else f"{NOT_REPRODUCED} at {_sizes(evidence)}"
+
+
+def _sizes(evidence: Evidence) -> str:
+    return " and ".join(sorted(evidence.tested["size"].unique(), key=lambda size: int(size.partition("x")[0])))
 
 
 def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:
@@ -170,97 +196,128 @@ def findings(run_set: RunSet) -> Page:
     Raises:
         ReportError: runs must not be compared, or are mixed in a cell.
     """
-    numbers, claims = published.load(), load()
-    tested = [(claim, evaluate(claim, run_set)) for claim in claims]
-    parts = ["# Findings", _answer(tested), "## Evidence", _table(tested, numbers), "## Rules", RULES.strip()]
-    return Page("findings.md", "\n\n".join(parts) + "\n")
+    numbers, tested = published.load(), judge(load(), run_set)
+    parts = ["# Findings", _answer(tested), "## Evidence", _table(tested, numbers), "## Scenes", _scenes(tested)]
+    return Page("findings.md", "\n\n".join([*parts, "## Rules", RULES.strip()]) + "\n")
 
 
-def _answer(tested: Sequence[tuple[Claim, Evidence]]) -> str:
-    paper = [evidence.verdict for claim, evidence in tested if claim.source != "padgs"]
-    first = f"Of {len(paper)} claims of the paper, {paper.count(HOLDS)} hold in the runs of this project and "
-    first += f"{paper.count(FAILS)} do not; the rest depend on the scene or are undecided."
+def _answer(tested: Sequence[Evidence]) -> str:
+    paper = [one.verdict for one in tested if one.claim.source != OURS]
+    failed = sum(verdict.startswith((NOT_REPRODUCED, FAILS)) for verdict in paper)
+    first = f"Of {len(paper)} claims of the paper, {paper.count(HOLDS)} hold in the runs of this project and {failed} "
+    first += "do not; the rest depend on the scene, are undecided or were not measured."
     lines = []
-    for verdict in (HOLDS, FAILS, MIXED, UNDECIDED, UNMEASURED):
-        chosen = [claim for claim, evidence in tested if evidence.verdict == verdict]
-        texts = [" ".join(filter(None, (f"- {claim.text} ({claim.source}).", claim.note))) for claim in chosen]
+    for verdict in dict.fromkeys((HOLDS, *sorted(one.verdict for one in tested))):
+        claims = [one.claim for one in tested if one.verdict == verdict]
+        texts = [" ".join(filter(None, (f"- {claim.text} ({claim.source}).", claim.note))) for claim in claims]
         lines += [f"**{verdict.capitalize()}:**\n\n" + "\n".join(texts)] if texts else []
     return "\n\n".join([first, *lines])
 
 
-def _table(tested: Sequence[tuple[Claim, Evidence]], numbers: Mapping[Key, Published]) -> str:
+def _table(tested: Sequence[Evidence], numbers: Mapping[Key, Published]) -> str:
     lines = [
-        "| claim | source | number | advantage | interval | ahead on | strongest rivals | in the paper | verdict |",
-        "| --- | --- | --- | ---: | ---: | ---: | --- | --- | --- |",
+        "| claim | source | number | advantage | interval | p | ahead on | strongest rivals | in the paper | verdict |",
+        "| --- | --- | --- | ---: | ---: | ---: | ---: | --- | --- | --- |",
     ]
-    for claim, evidence in tested:
-        cells = [claim.text, claim.source, claim.measure.column.title, *[MISSING] * 4]
-        if len(evidence.pairs):
-            by_scene = evidence.by_scene
-            cells[3] = claim.show(evidence.units.mean())
-            cells[4] = " to ".join(map(claim.show, evidence.interval)) if evidence.interval else MISSING
-            cells[5] = f"{(by_scene > 0).sum()} of {len(by_scene)} scenes"
-            cells[6] = "; ".join(evidence.pairs["rival"].unique())
+    for one in tested:
+        claim, scenes = one.claim, one.tested
+        cells = [claim.text, claim.source, claim.measure.column.title, *[MISSING] * 5]
+        if len(scenes):
+            cells[3] = claim.show(scenes["advantage"].mean())
+            cells[6] = f"{(scenes['advantage'] > 0).sum()} of {len(scenes)} scenes"
+            cells[7] = "; ".join(scenes["rival"].unique())
+        if one.interval:
+            cells[4], cells[5] = " to ".join(map(claim.show, one.interval)), f"{one.p:.2g}"
         paper = in_the_paper(claim, numbers)
         cells.append("<br>".join(f"{where}: {claim.show(value)}" for where, value in paper.items()) or MISSING)
-        lines.append(f"| {' | '.join([*cells, evidence.verdict])} |")
+        lines.append(_line([*cells, one.verdict]))
     return "\n".join(lines)
 
 
-def _pairs(claim: Claim, run_set: RunSet) -> Iterator[tuple[DataFrame, int]]:
-    """Yield the advantage of each seed that both sides have, and the number of rivals, of each scene and condition.
+def _scenes(tested: Sequence[Evidence]) -> str:
+    lines = ["| claim | scene | size, length | seeds: ours, rival | rival | advantage |"]
+    lines.append("| --- | --- | --- | ---: | --- | ---: |")
+    for one in tested:
+        for row in one.scenes.to_dict("records"):
+            shown = one.claim.show(row["advantage"]) + ("" if row["tested"] else " (not tested)")
+            size = f"{row['size']}, {row['length']}"
+            lines.append(_line([one.claim.text, row["scene"], size, row["seeds"], row["rival"], shown]))
+    return "\n".join(lines)
 
-    The longest runs that both sides have count.
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell if '<br>' in cell else markdown_text(cell) for cell in cells)} |"
+
+
+def measured(claim: Claim, run_set: RunSet) -> DataFrame:
+    """Return a row for each scene (and value of `within`): the advantage of the means over seeds over the best rival's.
+
+    Of the sizes and lengths that both sides have, those with `LEAST_SEEDS` of both count first, then the widest, then
+    the longest.
     """
     runs = run_set.of_experiments(*claim.experiments)
     if claim.scenes:
         runs = runs.loc[[place.outdoor is (claim.scenes == "outdoor") for place in runs["place"]]]
     ours, others = claim.sides
-    shared = ("resolution", "data", *claim.within, *(["machine"] if claim.metric in COSTS else []))
-    for (place, resolution, *_), alike in grouped(runs, "place", *shared) if len(runs) else ():
-        lengths = set(ours.select(alike)["length"]) & set(others.select(alike)["length"])
-        both = alike.loc[alike["length"].isin(lengths)].sort_values("iterations", kind="stable", ascending=False)
-        for length in dict.fromkeys(both["length"]):
-            where = f"{claim.text}, {place.scene}, {resolution}, {length}"
-            own = both.loc[both["length"] == length]
-            refuse_mixture(own, run_set.request, where, ("protocol",))
-            if made := _beside_best(claim, one_setting(ours.select(own), where), others.select(own)):
-                yield made[0].assign(scene=place.label), made[1]
-                break
+    shared = ("place", *claim.within, "resolution", "length", "data")
+    shared += ("machine",) if claim.metric in COSTS else ()
+    best: dict[Any, dict[str, Any]] = {}
+    for values, alike in grouped(runs, *shared) if len(runs) else ():
+        found = dict(zip(shared, values, strict=True))
+        size, length = found["resolution"], found["length"]
+        where = f"{claim.text}, {found['place'].scene}, {size}, {length}"
+        refuse_mixture(alike, run_set.request, where, ("protocol",))
+        if row := _beside_best(claim, one_setting(ours.select(alike), where), others.select(alike)):
+            row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
+            row |= {"scene": found["place"].label, "size": size, "length": length, "width": int(size.partition("x")[0])}
+            row["iterations"] = alike["iterations"].max()
+            row["as published"] = bool(row["width"] >= PUBLISHED_WIDTH and row["iterations"] >= PUBLISHED_ITERATIONS)
+            key = tuple(found[name] for name in ("place", *claim.within))
+            rank = itemgetter("tested", "width", "iterations")
+            best[key] = max(row, best[key], key=rank) if key in best else row
+    rows = DataFrame([best[key] for key in sorted(best, key=lambda key: key[0].rank)])
+    if claim.within and len(rows):
+        by_scene = rows.groupby("scene", sort=False)
+        means = {"advantage": by_scene["advantage"].mean(), "tested": by_scene["tested"].all()}
+        rows = by_scene.first().assign(**means).reset_index()
+    return rows
 
 
-def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> tuple[DataFrame, int] | None:
-    """Return seed, rival and advantage over the rival with the best mean, and the number of rivals."""
+def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, Any] | None:
+    """Return the advantage over the rival with the best mean, its title, and the seeds of both."""
     first, higher = _numbers(claim, ours), claim.measure.column.higher_is_better
     rivals = {}
     for setting in settings(others.drop(index=ours.index, errors="ignore")) if len(others) else ():
-        theirs = _numbers(claim, setting.runs)
-        if seeds := sorted(first.keys() & theirs.keys()):
-            rivals[setting.title] = {seed: claim.advantage(first[seed], theirs[seed], higher) for seed in seeds}
-    if not rivals:
+        if len(theirs := _numbers(claim, setting.runs)):
+            rivals[setting.title] = theirs
+    if not rivals or not len(first):
         return None
-    best = min(rivals, key=lambda title: sum(rivals[title].values()) / len(rivals[title]))
-    rows = [{"seed": seed, "rival": best, "advantage": value} for seed, value in rivals[best].items()]
-    return DataFrame(rows), len(rivals)
+    advantages = {title: claim.advantage(first.mean(), of.mean(), higher) for title, of in rivals.items()}
+    rival = min(advantages, key=lambda title: advantages[title])
+    seeds = len(first), len(rivals[rival])
+    counts = {"tested": min(seeds) >= LEAST_SEEDS, "seeds": f"{seeds[0]}, {seeds[1]}"}
+    return {"rival": rival, "advantage": advantages[rival], **counts}
 
 
-def _numbers(claim: Claim, runs: DataFrame) -> dict[int, float]:
-    """Return seed -> number of successful runs."""
-    numbers = runs.loc[runs["ok"]].reindex(columns=["seed", claim.metric]).dropna()
-    return dict(zip(numbers["seed"], numbers[claim.metric].astype(float), strict=True))
+def _numbers(claim: Claim, runs: DataFrame) -> Any:
+    """Return the numbers of successful runs."""
+    return runs.loc[runs["ok"]].reindex(columns=[claim.metric])[claim.metric].dropna().astype(float)
 
 
 RULES = f"""
 `padgs report findings RUNS --out docs` makes this page from runs, for the project itself from
 `reports/measured/results.jsonl`, and the claims in `reports/claims.yaml`.
 
-An advantage is the difference of the favoured side from the best of the others with the same seed, or for costs the
-ratio (×); it is positive, or above 1, where the claim is right. The longest runs of a scene that both sides have are
-compared. The interval has a confidence of {CONFIDENCE:.0%} (paired t-test, `scipy.stats.ttest_rel`), corrected for the
-number of rivals (Bonferroni). Its units are scenes, or the seeds of all scenes if there are fewer than {LEAST_SCENES}.
+An advantage is the difference of the favoured side's mean over seeds from the best of the others, or for costs the
+ratio (×); it is positive, or above 1, where the claim is right. Each scene counts once: with the widest, then the
+longest runs that both sides have with at least {LEAST_SEEDS} seeds. A scene with fewer seeds of a side, or without a
+rival that the claim requires, is listed but not tested. The test is a paired t-test over scenes
+(`scipy.stats.ttest_rel`); the interval has a confidence of {CONFIDENCE:.0%}, and p is corrected for all claims (Holm).
 
-A claim *holds* if the whole interval and every scene are on its side, and *does not hold* if they are on the other.
-It *depends on the scene* if scenes disagree, and is *undecided* if they agree, but the interval contains zero.
+A claim *holds* if p is below {1 - CONFIDENCE:.2g} and every scene is on its side. If they are on the other, it
+*does not hold* at the paper's size and length, and is *not reproduced* at others. It *depends on the
+scene* if scenes disagree, and is *undecided* without significance. Claims of the paper are judged against the paper's
+methods as published.
 
 All methods train with learning rates that fit the length of a run (`train.learning_rates=run`). On `bedroom` after 6400
 iterations OmniGS loses 0.55 dB by it ([table](../reports/measured/learning_rates.md)), which favours PaD-GS.

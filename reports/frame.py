@@ -10,12 +10,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any
 
 import pandas as pd
 from pandas import DataFrame
 
+from padgs.checks import printable
 from padgs.reports.published import Place
 from padgs.reports.store import Run
 from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_STATED, Result, Scores, picture_name
@@ -30,7 +32,7 @@ LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.trainin
 def frame(runs: Iterable[Run]) -> DataFrame:
     """Return the frame of runs in their order; the index counts them."""
     runs = list(runs)
-    results = [run.result for run in runs]
+    results = [_cleaned(run.result) for run in runs]
     facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()}, dtype=object)
     facts["log"], facts["renders"] = [run.log for run in runs], [run.renders for run in runs]
     numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
@@ -41,6 +43,24 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     metrics = _columns([dict(_metrics(result)) for result in results], float)
     config = _columns([dict(_flat(result.config)) for result in results], object).add_prefix(CONFIG)
     return pd.concat([facts.astype({"ok": bool}), rules, metrics, numbers, config], axis=1)
+
+
+def _cleaned(result: Result) -> Result:
+    """Return a result whose texts are one line without control characters, as every report shows them."""
+    names = ("run", "variant", "scene", "code_version", "machine", "config", "finished")
+    scores = {
+        name: replace(of, protocol=_one_line(of.protocol), metrics=_one_line(of.metrics))
+        for name, of in result.scores.items()
+    }
+    return replace(result, scores=scores, **{name: _one_line(getattr(result, name)) for name in names})
+
+
+def _one_line(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {_one_line(key): _one_line(own) for key, own in value.items()}
+    if isinstance(value, list):
+        return [_one_line(own) for own in value]
+    return printable(value, kept="") if isinstance(value, str) else value
 
 
 def grouped(runs: DataFrame, *columns: str) -> list[tuple[tuple[Any, ...], DataFrame]]:

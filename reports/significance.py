@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +15,12 @@ from padgs.reports.table import Block, Cell, Column, format_number
 
 BEST, SECOND = "best", "second"
 CONFIDENCE = 0.95
+SEEDS = 3  # at least, of a row that is marked as best or second
+WIDEST = 0.02  # largest difference of rows that share a mark, as a share of their number
 NOTE = (
-    "Bold: best; underlined: second; rows that seeds cannot separate share a place (Welch's t-test, two-sided, "
-    f"{CONFIDENCE:.0%}; a single run is taken to scatter as the seeds of the other rows; where these are no more than "
-    "one pair, single runs tie with their equals only)."
+    f"Bold: best; underlined: second, by at least {SEEDS} seeds. Rows that seeds cannot separate share a place "
+    f"(Welch's t-test, two-sided, {CONFIDENCE:.0%}). A column has no mark from the place on that spans more than "
+    f"{WIDEST:.0%}, or that a row with fewer seeds could take."
 )
 
 
@@ -62,14 +64,22 @@ def mean_cell(values: Sequence[float], failed: str = "") -> Cell:
 
 
 def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int, str]:
-    """Return row -> BEST or SECOND for the column `index` of a block.
+    """Return row -> BEST or SECOND for the column `index` of a block; see `NOTE`.
 
     Cells that are not `ranked` are left out. Nothing is highlighted without a direction, or if all rows tie.
     """
-    every = ((i, row.cells[index]) for i, row in enumerate(block.rows))
+    column, every = columns[index], ((i, row.cells[index]) for i, row in enumerate(block.rows))
     cells = {i: cell for i, cell in every if cell.value is not None and cell.ranked}
-    shared = places(cells, columns[index])
-    return {i: rank for rank, rows in zip((BEST, SECOND), shared, strict=False) for i in rows if len(shared) > 1}
+    sign = -1.0 if column.higher_is_better else 1.0
+    few = min((sign * (cell.value or 0.0) for cell in cells.values() if cell.count < SEEDS), default=math.inf)
+    shared = places({i: cell for i, cell in cells.items() if cell.count >= SEEDS}, column)
+    found: dict[int, str] = {}
+    for rank, rows in zip((BEST, SECOND), shared if len(shared) > 1 else (), strict=False):
+        numbers = [sign * (cells[i].value or 0.0) for i in rows]
+        if few <= max(numbers) or max(numbers) - min(numbers) > WIDEST * max(map(abs, numbers)):
+            break
+        found |= dict.fromkeys(rows, rank)
+    return found
 
 
 def places(cells: Mapping[int, Cell], column: Column) -> list[list[int]]:
@@ -80,57 +90,23 @@ def places(cells: Mapping[int, Cell], column: Column) -> list[list[int]]:
     >>> places(dict(enumerate([Cell(24.0, 0.1, 3), Cell(25.0, 0.1, 3), Cell(25.1, 0.1, 3)])), Column("PSNR", 2, True))
     [[2, 1], [0]]
     """
-    better = better_rows(cells, column)
     sign = -1.0 if column.higher_is_better else 1.0
     found: list[list[int]] = []
     for i in sorted(cells, key=lambda i: sign * (cells[i].value or 0.0)):
-        if found and better[i].isdisjoint(found[-1]):
+        if found and not any(differ(cells[i], cells[j], column) for j in found[-1]):
             found[-1].append(i)
         else:
             found.append([i])
     return found
 
 
-def better_rows(cells: Mapping[int, Cell], column: Column) -> dict[int, set[int]]:
-    """Return row -> the significantly better rows; numbers that print alike are equal.
+def differ(first: Cell, second: Cell, column: Column) -> bool:
+    """Return whether two means differ significantly (Welch's t-test); numbers that print alike do not."""
+    from scipy.stats import ttest_ind_from_stats
 
-    No row is better in a column without a direction.
-    """
-    sign = {True: 1.0, False: -1.0, None: math.nan}[column.higher_is_better]
-    numbers = {i: sign * (cell.value or 0.0) for i, cell in cells.items()}
-    printed = {i: float(format_number(number, column)) for i, number in numbers.items()}
-    pooled = pooled_variance(cells.values())
-
-    def is_better(i: int, j: int) -> bool:
-        ahead = numbers[j] - numbers[i]
-        # Most pairs are decided by the first of these; the last takes the time of a t-test.
-        return ahead > 0 and printed[i] != printed[j] and ahead > _least_difference(cells[i], cells[j], pooled)
-
-    return {i: {j for j in cells if is_better(i, j)} for i in cells}
-
-
-def pooled_variance(cells: Collection[Cell]) -> tuple[float, int]:
-    """Return variance and degrees of freedom of one run about the mean of its cell, pooled over repeated cells.
-
-    One pair of seeds in all says next to nothing (t = 12.7) and counts as none.
-    """
-    freedom = sum(cell.count - 1 for cell in cells if cell.std is not None)
-    squares = sum((cell.count - 1) * cell.std**2 for cell in cells if cell.std is not None)
-    return (squares / freedom, freedom) if freedom > 1 else (0.0, 0)
-
-
-def _least_difference(first: Cell, second: Cell, pooled: tuple[float, int]) -> float:
-    """Return the least significant difference of two means: Welch's test with Satterthwaite's degrees of freedom.
-
-    Two single runs share one pooled estimate of the variance, with its own degrees of freedom.
-    """
-    from scipy.special import stdtrit
-
-    parts = [(c.std**2, c.count - 1) if c.std is not None else pooled for c in (first, second)]
-    shares = [(variance / c.count, df) for (variance, df), c in zip(parts, (first, second), strict=True)]
-    total = sum(share for share, _ in shares)
-    if not total:
-        return 0.0
-    single = first.std is None and second.std is None
-    freedom = pooled[1] if single else total**2 / sum(share**2 / df for share, df in shares if share)
-    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2)) * math.sqrt(total)
+    printed = {format_number(cell.value or 0.0, column) for cell in (first, second)}
+    if column.higher_is_better is None or len(printed) == 1:
+        return False
+    one, other = ((cell.value or 0.0, cell.std or 0.0, cell.count) for cell in (first, second))
+    with np.errstate(divide="ignore", invalid="ignore"):  # without any spread the means decide
+        return bool(ttest_ind_from_stats(*one, *other, equal_var=False).pvalue < 1 - CONFIDENCE)

@@ -18,7 +18,7 @@ from padgs.reports.frame import CONFIG
 from padgs.reports.measures import Measure, costs, metric, metrics
 from padgs.reports.published import Place
 from padgs.reports.selection import is_number
-from padgs.reports.significance import NOTE
+from padgs.reports.significance import NOTE, SEEDS
 
 Measures = tuple[Measure, ...]
 
@@ -43,7 +43,6 @@ class Spec:
     rows: str = "preset"  # column whose values are rows; "setting": see `selection.settings`; "run": all runs
     titles: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # method -> value -> title; {}: all presets
     difference: str = ""  # note on a column with the difference of each PSNR from the first row's
-    effects: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # title -> weight of each row
     by_rank: bool = False  # sort by the first measure, and add a column of ranks
     equal_images: bool | None = None  # leave out of the ranking: see `conditions.unranked`; None: nothing
     # Columns of the paper, and notes
@@ -79,11 +78,6 @@ DEVIATIONS = {  # method -> variant -> title
 }
 VOXELS = {"padgs_small": "one anchor per 3 px", "padgs": "one anchor per 0.1 px"}  # ours for the paper's 0.001
 CROSSED = {f"{preset} {tau}": f"{title}, τ = {tau:g}" for preset, title in VOXELS.items() for tau in (0.0, 0.9)}
-EFFECTS = {  # title -> weight of each of CROSSED
-    "one anchor per 0.1 px instead of 3 px": (-0.5, -0.5, 0.5, 0.5),
-    "τ = 0.9 instead of 0": (-0.5, 0.5, -0.5, 0.5),
-    "both, beyond the sum of the two": (1.0, -1.0, -1.0, 1.0),
-}
 BANDS = ("equator", "middle", "high", "pole")
 WS_PSNR = (metric("sphere", "ws_psnr"),)
 PAPER = tuple(metric("paper", name, "paper") for name in ("psnr", "ssim", "lpips_vgg_01"))
@@ -230,7 +224,11 @@ SPECS: Mapping[str, Spec] = {
         rows="setting",
         by_rank=True,
         protocols=("paper", "sphere"),
-        notes=("Rank: 1 + the number of rows in better places by WS-PSNR, where rows that tie share one.", NOTE),
+        notes=(
+            f"Rank: 1 + the number of rows in better places by WS-PSNR, where all rows have {SEEDS} seeds; rows "
+            "that tie share one.",
+            NOTE,
+        ),
     ),
     "length": Spec(
         "WS-PSNR after training of different length",
@@ -240,7 +238,6 @@ SPECS: Mapping[str, Spec] = {
         conditions=("protocol", "data"),
         pivot=("rates", "iterations"),
         protocols=("sphere",),
-        notes=("The longest: of the same rates, or where these lack it, of the others.", NOTE),
     ),
     "learning_rates": Spec(
         "WS-PSNR for factors on all learning rates",
@@ -264,12 +261,7 @@ SPECS: Mapping[str, Spec] = {
         blocks=("resolution", "length"),
         rows="crossed",
         titles={"padgs": CROSSED},
-        effects=EFFECTS,
         protocols=("paper", "sphere"),
-        notes=(
-            "Effects: mean and spread of the differences within each seed, over the levels of the other factor.",
-            NOTE,
-        ),
     ),
     "capacity": Spec(
         "Methods with equal numbers of Gaussians",

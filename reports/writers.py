@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -17,10 +18,13 @@ from padgs.results import file_name
 
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
+SPECIAL |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"}
 SPECIAL |= {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
 SPECIAL |= {"†": r"\dag{}", "τ": r"$\tau$", "√": r"$\surd$"}
 LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}
 MARKDOWN_MARKS = {None: "{}", BEST: "**{}**"}
+MARKDOWN_SPECIAL = re.compile(r"[\\`*_\[\]|~$#<]|&(?=[#\w])|:(?=//)|(?<=www)\.")
+ENTITIES = {"<": "&lt;", "&": "&amp;"}
 COLUMNS_OF_A_PAGE = 12  # upright
 
 
@@ -80,19 +84,19 @@ def rows_of(table: Table) -> list[tuple[str, list[tuple[str, str | None]]]]:
 
 def markdown(table: Table) -> str:
     """Return GitHub Markdown, a table a block, with the best number of each column bold and the second underlined."""
-    parts = [f"## {_plain(table.title)}"]
+    parts = [f"## {markdown_text(table.title)}"]
     for block in table.blocks:
         single = table.single(block)
         lines = [
-            [table.corner, *(column.heading for column in single.columns)],
+            [table.corner, *(markdown_text(column.heading) for column in single.columns)],
             ["---", *["---:"] * len(single.columns)],
         ]
         for title, cells in rows_of(single):
-            marked = (MARKDOWN_MARKS.get(rank, "<ins>{}</ins>").format(_escaped(text)) for text, rank in cells)
-            lines.append([_escaped(title), *marked])
-        parts.append("\n".join([f"### {_plain(block.title)}\n", *(f"| {' | '.join(line)} |" for line in lines)]))
+            marked = (MARKDOWN_MARKS.get(rank, "<ins>{}</ins>").format(markdown_text(text)) for text, rank in cells)
+            lines.append([markdown_text(title), *marked])
+        parts.append("\n".join([f"### {markdown_text(block.title)}\n", *(f"| {' | '.join(line)} |" for line in lines)]))
     if table.notes:
-        parts.append("\n".join(f"- {_escaped(note)}" for note in table.notes))
+        parts.append("\n".join(f"- {markdown_text(note)}" for note in table.notes))
     return "\n\n".join(parts) + "\n"
 
 
@@ -143,7 +147,7 @@ def escaped(words: str) -> str:
     >>> escaped("50 % of a_b ↑")
     '50 \\\\% of a\\\\_b $\\\\uparrow$'
     """
-    return "".join(SPECIAL.get(character, character) for character in _printable(words))
+    return "".join(SPECIAL.get(character, character) for character in words)
 
 
 def _headings(table: Table) -> list[str]:
@@ -170,15 +174,10 @@ def _line(cells: list[str]) -> str:
     return f"    {guard}{' & '.join(cells)} \\\\"
 
 
-def _printable(words: str) -> str:
-    """Replace control characters, which a terminal obeys, and line breaks, which end a caption."""
-    return "".join(c if c.isprintable() else " " for c in words)
+def markdown_text(words: str) -> str:
+    r"""Return text that GitHub Markdown prints as it is, in a table as well.
 
-
-def _plain(words: str) -> str:
-    """Return one line without HTML."""
-    return _printable(words).replace("<", "&lt;")
-
-
-def _escaped(words: str) -> str:
-    return _plain(words).replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
+    >>> markdown_text("![a](https://b) <c> | `d_1`")
+    '!\\[a\\](https\\://b) &lt;c> \\| \\`d\\_1\\`'
+    """
+    return MARKDOWN_SPECIAL.sub(lambda found: ENTITIES.get(found[0], f"\\{found[0]}"), words)

@@ -35,7 +35,6 @@ OTHERS = (("#44aa99", "#44aa99"), ("#999933", "#b3b34a"), ("#882255", "#cc6f9c")
 INK = ("#1d2330", "#e4e8ef")
 SOFT = ("#5b6475", "#a3acbc")
 GRID = ("#e3e6eb", "#333a46")
-MARGIN_COLOR = ("#f1f3f6", "#20262f")  # behind marks of values beyond the axis
 PAPER = ("#ffffff", "#171b22")
 COLORS = tuple(light for light, _ in (*FAMILIES.values(), *OTHERS))
 ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
@@ -144,7 +143,7 @@ def color_of(preset: str, presets: Sequence[str]) -> str:
 
 def dark_rules() -> str:
     """Return CSS that replaces all colours on dark screens; programs that ignore the rules show white paper."""
-    pairs = dict((*FAMILIES.values(), *OTHERS, INK, SOFT, GRID, MARGIN_COLOR, PAPER))
+    pairs = dict((*FAMILIES.values(), *OTHERS, INK, SOFT, GRID, PAPER))
     rules = [
         f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
         for light, dark in pairs.items()

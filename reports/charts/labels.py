@@ -1,4 +1,4 @@
-"""Labels beside the marks of a chart: never on each other or outside the axes, off marks and lines if possible."""
+"""Labels beside the marks of a chart: never on each other or outside the axes, off other marks if possible."""
 
 from __future__ import annotations
 
@@ -16,15 +16,9 @@ GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0, 140.0, 1
 DIRECTIONS = 24
 BESIDE = 7.0  # pixels between a mark and its label; a label further away has a leader line
 CLEARANCE = 1.5  # pixels around a label
-STEP = 5.0  # pixels between two points of a line that labels avoid
+ON_A_MARK = 0.8  # cost of a covered square pixel of a mark, in pixels of distance
 OURS = ("padgs", "padgs_plus")  # methods with bold labels
 FONT_SIZES = {"bold": 9.0, "normal": 8.5, "faint": 7.0}  # points, by weight
-# Costs in pixels of distance:
-ON_A_MARK, ON_A_LINE = 0.8, 4.0  # a covered square pixel of another mark; a covered point of a line
-LEADER, CROSSING = 12.0, 60.0  # a leader line; a leader line across a mark or a label
-NEARER_TO_ANOTHER, BELOW_LEFT = 10.0, 2.0  # nearer to another mark; not to the right and above
-
-Line = Sequence[tuple[float, float]]  # corners in data coordinates
 
 
 @dataclass(frozen=True)
@@ -37,9 +31,7 @@ class Label:
     weight: str  # key of `FONT_SIZES`
 
 
-def write_labels(
-    panel: Any, labels: Sequence[Label], marks: Sequence[tuple[float, float, float]], lines: Sequence[Line] = ()
-) -> list[Any]:
+def write_labels(panel: Any, labels: Sequence[Label], marks: Sequence[tuple[float, float, float]]) -> list[Any]:
     """Write labels one after the other, each at its cheapest place, and return the texts that found one.
 
     Positions are fractions of the figure, so its layout must be fixed, and all file formats agree.
@@ -48,12 +40,11 @@ def write_labels(
         panel: matplotlib axes.
         labels: the important ones first.
         marks: x, y (data) and radius (points) of all marks, with and without a label.
-        lines: lines that labels should not cover.
     """
     figure, points = panel.figure, panel.figure.dpi / 72
     to_pixels, to_figure = panel.transData.transform, figure.transFigure.inverted().transform
-    discs = np.array([(*to_pixels((x, y)), radius * points) for x, y, radius in marks])
-    avoided = np.concatenate([np.zeros((0, 2)), *(_along(to_pixels(line)) for line in lines)])
+    discs = np.array([(*to_pixels((x, y)), radius * points) for x, y, radius in marks]).reshape(-1, 3)
+    squares = np.concatenate([discs[:, :2] - discs[:, 2:], discs[:, :2] + discs[:, 2:]], 1)
     inside = panel.get_window_extent().padded(-CLEARANCE)
     taken, written = np.zeros((0, 4)), []
     for label in labels:
@@ -64,18 +55,16 @@ def write_labels(
         boxes, costs = _candidates(at, radius, np.array([extent.width, extent.height]))
         free = (boxes[:, :2] >= inside.min).all(1) & (boxes[:, 2:] <= inside.max).all(1)
         free &= ~_overlap(boxes, taken).any(1)
-        boxes, costs = boxes[free], costs[free]
-        if not len(boxes):
+        if not free.any():
             text.remove()
             continue
-        starts, ends = _leaders(boxes, at, radius)
-        costs = costs + _obstruction(boxes, starts, ends, discs, at, taken) + ON_A_LINE * _covered(boxes, avoided)
-        best = int(costs.argmin())
-        taken = np.concatenate([taken, boxes[best : best + 1] + np.array([-1, -1, 1, 1]) * CLEARANCE])
-        text.set_position(to_figure(boxes[best].reshape(2, 2).mean(0)))
-        if np.linalg.norm(ends[best] - starts[best]) > BESIDE:
-            leader = np.stack([starts[best], ends[best]])
-            avoided = np.concatenate([avoided, _along(leader)])
+        boxes, costs = boxes[free], costs[free]
+        box = boxes[np.argmin(costs + ON_A_MARK * _overlap(boxes, squares).sum(1))]
+        taken = np.concatenate([taken, [box + np.array([-1, -1, 1, 1]) * CLEARANCE]])
+        text.set_position(to_figure(box.reshape(2, 2).mean(0)))
+        end = np.clip(at, box[:2], box[2:])
+        if (distance := np.linalg.norm(end - at)) - radius > BESIDE:
+            leader = np.stack([at + (end - at) * radius / distance, end])
             panel.plot(*panel.transData.inverted().transform(leader).T, color=SOFT[0], linewidth=0.5, zorder=1.6)
         written.append(text)
     return written
@@ -87,51 +76,15 @@ def weight_of(preset: str, role: str) -> str:
 
 
 def _candidates(at: NDArray, radius: float, size: NDArray) -> tuple[NDArray, NDArray]:
-    """Return boxes [n, 4] (left, bottom, right, top) around a mark, and the costs [n] of their distances."""
+    """Return boxes [n, 4] (left, bottom, right, top) around a mark, and costs [n]: best near and to the upper right."""
     gaps, angles = np.repeat(GAPS, DIRECTIONS), np.tile(np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS), len(GAPS))
     direction = np.stack([np.cos(angles), np.sin(angles)], 1)
     # The middle of a box that moves around the disc of the mark without touching it.
     middles = at + (radius + gaps)[:, None] * direction + size / 2 * np.clip(1.5 * direction, -1, 1)
-    boxes = np.concatenate([middles - size / 2, middles + size / 2], 1)
-    return boxes, gaps + LEADER * (gaps > BESIDE) + BELOW_LEFT * (2 - direction.sum(1))
-
-
-def _leaders(boxes: NDArray, at: NDArray, radius: float) -> tuple[NDArray, NDArray]:
-    """Return the starts [n, 2] at the edge of a mark and the ends [n, 2] of the shortest lines to the boxes."""
-    ends = np.clip(at, boxes[:, :2], boxes[:, 2:])
-    distance = np.linalg.norm(ends - at, axis=1, keepdims=True)
-    return at + (ends - at) * np.minimum(radius / np.maximum(distance, 1e-9), 1), ends
-
-
-def _obstruction(
-    boxes: NDArray, starts: NDArray, ends: NDArray, discs: NDArray, at: NDArray, taken: NDArray
-) -> NDArray:
-    """Return the costs [n] of covering other marks, of standing nearer to another, and of leaders across them."""
-    others = discs[(discs[:, :2] != at).any(1)]
-    squares = np.concatenate([others[:, :2] - others[:, 2:], others[:, :2] + others[:, 2:]], 1)
-    gaps = np.clip(others[:, :2], boxes[:, None, :2], boxes[:, None, 2:]) - others[:, :2]
-    nearest = (np.linalg.norm(gaps, axis=2) - others[:, 2]).min(1, initial=np.inf)
-    on_leaders = starts[:, None] + (ends - starts)[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
-    obstacles = np.concatenate([squares, taken])
-    through = (on_leaders[:, :, None] >= obstacles[:, :2]) & (on_leaders[:, :, None] <= obstacles[:, 2:])
-    costs = ON_A_MARK * _overlap(boxes, squares).sum(1) + CROSSING * np.any(np.all(through, axis=3), axis=1).sum(1)
-    return costs + NEARER_TO_ANOTHER * (nearest < np.linalg.norm(ends - starts, axis=1))
+    return np.concatenate([middles - size / 2, middles + size / 2], 1), gaps + 2 * (2 - direction.sum(1))
 
 
 def _overlap(boxes: NDArray, others: NDArray) -> NDArray:
     """Return the areas [n, m] that boxes [n, 4] share with others [m, 4]."""
     shared = np.minimum(boxes[:, None, 2:], others[:, 2:]) - np.maximum(boxes[:, None, :2], others[:, :2])
     return np.clip(shared, 0, None).prod(2)
-
-
-def _covered(boxes: NDArray, points: NDArray) -> NDArray:
-    """Return how many points [m, 2] each box [n, 4] covers [n]."""
-    return ((points >= boxes[:, None, :2] - CLEARANCE) & (points <= boxes[:, None, 2:] + CLEARANCE)).all(2).sum(1)
-
-
-def _along(corners: NDArray) -> NDArray:
-    """Return points [n, 2] at most `STEP` apart on a line through corners [m, 2]."""
-    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1) / STEP
-    counts = np.maximum(steps.astype(int), 1)
-    pieces = [np.linspace(a, b, count + 1) for a, b, count in zip(corners, corners[1:], counts, strict=False)]
-    return np.concatenate(pieces) if pieces else np.zeros((0, 2))

@@ -9,7 +9,7 @@ from typing import Any
 from pandas import DataFrame
 
 from padgs.reports import methods
-from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.axis import set_axis
 from padgs.reports.charts.drawing import INK, Chart, figure, lay_out, styled, tip
 from padgs.reports.charts.labels import Label, weight_of, write_labels
 from padgs.reports.robustness import QUALITY, Stress, StressedMethod, all_stress
@@ -69,8 +69,8 @@ def speed_and_accuracy(title: str, stressed: Sequence[StressedMethod]) -> Chart:
     points = [(one.reference[time].mean(), one.reference[QUALITY].mean()) for one in stressed]
     made, axes = figure(1, 1, 5.6, 4.4)
     own, rows, labels = axes[0][0], [], []
-    Axis.of([cost for cost, _ in points], True).apply(own.xaxis)
-    Axis.of([quality for _, quality in points]).apply(own.yaxis)
+    set_axis(own.xaxis, [cost for cost, _ in points], True)
+    set_axis(own.yaxis, [quality for _, quality in points])
     own.set_xlabel(f"{words} without stress, s ↓")
     own.set_ylabel("WS-PSNR without stress, dB ↑")
     for one, (cost, quality) in zip(stressed, points, strict=True):

@@ -7,7 +7,7 @@ from typing import Any
 
 from pandas import DataFrame
 
-from padgs.reports.charts.axis import Axis, spans
+from padgs.reports.charts.axis import set_axis, spans
 from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, show_image, styled, tip
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
@@ -48,7 +48,7 @@ def _chart(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) ->
     presets = [curve.preset for curve in found]
     for panel, (quantity, words, unit) in zip(axes.flat, PANELS, strict=True):
         sizes = [v * unit for curve in found for v in curve.values(quantity) if math.isfinite(v)]
-        Axis.of(sizes, spans(sizes, LOG_RATIO)).apply(panel.xaxis)
+        set_axis(panel.xaxis, sizes, spans(sizes, LOG_RATIO))
         for method, seeds in by_method(found).items():
             color = color_of(seeds[0].preset, presets)
             for curve in seeds:

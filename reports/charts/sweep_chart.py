@@ -9,7 +9,7 @@ from typing import Any
 from pandas import DataFrame
 
 from padgs.reports import methods
-from padgs.reports.charts.axis import Axis, spans
+from padgs.reports.charts.axis import set_axis, spans
 from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, styled, tip
 from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
 from padgs.reports.frame import by_place, grouped
@@ -164,13 +164,13 @@ def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
     xs = [x for curve in sweep.curves for x, _ in curve.points]
     cells = [cells[index] for curve in sweep.curves for _, cells in curve.points]
     ends = [c.value + sign * (c.std or 0.0) for c in cells if c.value is not None for sign in (-1, 1)]
-    Axis.of(ends).apply(panel.yaxis)
+    set_axis(panel.yaxis, ends)
     panel.set_title(measure.column.heading, fontsize=9)
     panel.set_xlabel(sweep.key or "setting")
     if not all(isinstance(x, (int, float)) for x in xs):
         panel.tick_params(axis="x", labelrotation=20)
         return
-    Axis.of(xs, spans(xs, LOG_RATIO)).apply(panel.xaxis)
+    set_axis(panel.xaxis, xs, spans(xs, LOG_RATIO))
     if sweep.key in PAPER_CHOICES:
         panel.axvline(PAPER_CHOICES[sweep.key], color=SOFT[0], linestyle=":", linewidth=1)
 

@@ -77,12 +77,6 @@ class TradeOff:
         """Presets that are shown without competing, see `padgs.reports.unranked`."""
         return unranked(self.runs)
 
-    def corrected(self, point: Point) -> Point | None:
-        """Return the corrected method in the same setting as a released program, if there is one."""
-        preset = methods.published_as(point.preset)
-        title = point.title.replace(methods.title(point.preset), methods.title(preset), 1)
-        return next((p for p in self.points if (p.preset, p.title) == (preset, title) and p is not point), None)
-
     @property
     def numbers(self) -> DataFrame:
         """A row per number of each point, with all digits."""

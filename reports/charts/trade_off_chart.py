@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from padgs.reports import methods
-from padgs.reports.charts import time_chart
-from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.axis import set_axis
 from padgs.reports.charts.drawing import ALPHA, INK, PAPER, SOFT, Chart, color_of, figure, lay_out, styled, tip
-from padgs.reports.charts.labels import Label, Line, weight_of, write_labels
+from padgs.reports.charts.labels import Label, weight_of, write_labels
 from padgs.reports.charts.trade_off import Point, TradeOff, pareto, trade_offs
-from padgs.reports.measures import COSTS, Measure
-from padgs.reports.selection import RunSet
+from padgs.reports.measures import COSTS
+from padgs.reports.selection import RunSet, Setting, settings
 
 FRAME_TIME = ("frame_ms", "time per frame", "ms")  # cost, words, unit
 TRAINING_TIME, CPU_TIME = ("train_seconds", "training time", "s"), ("cpu_seconds", "training time on the CPU", "s")
-SIZE = (5.3, 4.6)  # inches of a panel
-# Areas of marks in points^2: with the most Gaussians, with few, without an area of meaning, and of arrow heads.
-LARGEST, SMALLEST, FIXED, ARROW = 300.0, 25.0, 30.0, 70.0
+SIZE, TIME_SIZE = (5.3, 4.6), (10.6, 4.2)  # inches of a panel, and of a chart of quality over time
+LARGEST, SMALLEST, FIXED = 300.0, 25.0, 30.0  # points^2 of marks: most Gaussians, few, and without such a meaning
+LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line over time
+    "main": {"linewidth": 1.3, "zorder": 2.2},
+    "variant": {"linewidth": 0.9, "zorder": 2.1},
+    "release": {"linewidth": 0.7, "zorder": 2.0, "linestyle": (0, (4, 2))},
+}
+END_RADIUS = 2.5  # points, of the mark at the end of a run
 
 
 @dataclass(frozen=True)
@@ -33,147 +38,159 @@ class Mark:
     role: str  # see `TradeOff.role`
     x: float  # cost
     y: float  # quality
-    at: tuple[float, float]  # position: (x, y), or in the margin
-    sides: tuple[int, int]  # end of each axis that it lies beyond: -1, 0 or 1
 
     @property
     def gaussians(self) -> float:
-        """The number that its area shows: 0 for releases, in the margin, and for methods without Gaussians."""
-        return 0.0 if self.role == "release" or any(self.sides) else self.point.gaussians
-
-    def area(self, scale: float) -> float:
-        """Return points^2, with `scale` points^2 per Gaussian."""
-        return ARROW if any(self.sides) else area(self.gaussians, scale) if self.gaussians else FIXED
-
-    def radius(self, scale: float) -> float:
-        """Return the radius in points."""
-        return math.sqrt(self.area(scale)) / 2
-
-
-@dataclass
-class Panel:
-    """Matplotlib axes and the marks of a trade-off."""
-
-    axes: Any
-    trade_off: TradeOff
-    cost: Measure
-    unit: str  # of the cost
-    x_axis: Axis
-    y_axis: Axis
-    lines: list[Line] = field(default_factory=list)  # that labels should not cover
-
-    @cached_property
-    def marks(self) -> list[Mark]:
-        """A mark for each point with a quality and a positive cost."""
-        found = []
-        for point in self.trade_off.points:
-            x, y = point.value(self.cost), point.value(self.trade_off.quality)
-            if x and y is not None:
-                at, sides = zip(
-                    *((a.position(v), a.side(v)) for a, v in ((self.x_axis, x), (self.y_axis, y))), strict=True
-                )
-                found.append(Mark(point, self.trade_off.role(point.preset), x, y, at, sides))
-        return found
-
-    def draw(self, scale: float) -> None:
-        """Draw axes, the Pareto front, links, standard deviations and marks, with `scale` points^2 per Gaussian."""
-        self.x_axis.apply(self.axes.xaxis)
-        self.y_axis.apply(self.axes.yaxis)
-        self._draw_front()
-        presets = [point.preset for point in self.trade_off.points]
-        for mark in self.marks:
-            color = color_of(mark.point.preset, presets)
-            if mark.role == "release" and (twin := self._twin(mark)):
-                self._line([mark.at, twin.at], color=color, linewidth=0.7, alpha=0.35, zorder=1.4)
-            for ends in self._deviations(mark):
-                self._line(ends, color=color, linewidth=0.8, alpha=0.6 * ALPHA[mark.role], zorder=2)
-            numbers = [f"{name}: {brief(c.value, 4)}" for name, c in mark.point.numbers.items() if c.value is not None]
-            look = {"s": mark.area(scale), "gid": tip("\n".join([mark.point.title, *numbers])), **_look(mark, color)}
-            self.axes.scatter(*mark.at, clip_on=False, **look)
-
-    def label(self, scale: float) -> list[Any]:
-        """Write labels, main presets first, and return the texts; call it when the layout is fixed.
-
-        A release has no label beside its corrected method. Labels in the margin have numbers.
-        """
-        labels = []
-        for mark in sorted(self.marks, key=lambda mark: mark.role != "main"):
-            if mark.role == "release" and self._twin(mark) and not any(mark.sides):
-                continue
-            x_side, y_side = mark.sides
-            values = [f"{mark.y:.1f} dB"] * bool(y_side) + [f"{brief(mark.x)} {self.unit}"] * bool(x_side)
-            text = "\n".join([methods.short(mark.point.title, mark.point.preset), ", ".join(values)]).strip()
-            labels.append(Label(text, mark.at, mark.radius(scale), weight_of(mark.point.preset, mark.role)))
-        return write_labels(self.axes, labels, [(*mark.at, mark.radius(scale)) for mark in self.marks], self.lines)
-
-    def _draw_front(self) -> None:
-        """Draw the Pareto front of all ranked points but releases, up to the end of the window."""
-        rivals = [m for m in self.marks if m.role != "release" and m.point.preset not in self.trade_off.unranked]
-        positions = {(mark.x, mark.y): mark.at for mark in rivals}
-        corners = [positions[point] for point in pareto([*positions])]
-        corners += [(max(self.x_axis.window[1], corners[-1][0]), corners[-1][1])] if corners else []
-        steps = [corner for (_, y), (x, top) in pairwise(corners) for corner in ((x, y), (x, top))]
-        self._line([*corners[:1], *steps], color=SOFT[0], linewidth=0.9, zorder=1.5)
-
-    def _line(self, corners: Line, **look: Any) -> None:
-        if corners:
-            self.lines.append(corners)
-            self.axes.plot(*zip(*corners, strict=True), **look)
-
-    def _twin(self, mark: Mark) -> Mark | None:
-        twin = self.trade_off.corrected(mark.point)
-        return next((other for other in self.marks if other.point is twin), None)
-
-    def _deviations(self, mark: Mark) -> list[Line]:
-        """Return lines of a standard deviation to each side, along axes where a mark with several seeds is in place."""
-        measures = (self.cost, self.trade_off.quality)
-        x_std, y_std = (mark.point.numbers[measure.column.title].std for measure in measures)
-        (x, y), (x_side, y_side) = mark.at, mark.sides
-        along: list[Line] = [[(max(x - x_std, x / 10), y), (x + x_std, y)]] if x_std and not x_side else []
-        return along + ([[(x, y - y_std), (x, y + y_std)]] if y_std and not y_side else [])
+        """The number that its area shows: 0 for releases and for methods without Gaussians."""
+        return 0.0 if self.role == "release" else self.point.gaussians
 
 
 def charts(run_set: RunSet) -> list[Chart]:
     """Return speed against accuracy, and quality over training time for runs with a log."""
-    made = [drawn for trade_off in trade_offs(run_set) for drawn in (chart(trade_off), time_chart.chart(trade_off))]
+    made = [drawn for trade_off in trade_offs(run_set) for drawn in (chart(trade_off), time_chart(trade_off))]
     return [drawn for drawn in made if drawn is not None]
 
 
 def chart(trade_off: TradeOff) -> Chart:
     """Return two panels with a common axis of quality and a label at each mark.
 
-    Axes show where methods differ (`axis.window`); marks beyond stand in the margin, with their numbers. The area of a
-    mark is proportional to the number of Gaussians. Releases are small rings, linked to their corrected method, and not
-    in the Pareto front. Variants are faint.
+    Axes show where methods differ (`axis.window`); a note names the marks beyond. The area of a mark is proportional to
+    the number of Gaussians. Releases are small rings, and not in the Pareto front. Variants are faint.
     """
-    return Chart(trade_off.name, trade_off.title, draw(trade_off)[0], trade_off.notes, trade_off.numbers)
+    made, panels = draw(trade_off)
+    beyond = {
+        f"{mark.point.title} ({mark.y:.1f} dB, {brief(mark.x)} {unit})"
+        for axes, marks, unit, _ in panels
+        for mark in marks
+        if not _inside(axes, mark)
+    }
+    notes = (*trade_off.notes, *([f"Beyond the axes: {'; '.join(sorted(beyond))}."] if beyond else []))
+    return Chart(trade_off.name, trade_off.title, made, notes, trade_off.numbers)
 
 
 @styled
-def draw(trade_off: TradeOff) -> tuple[Any, list[tuple[Panel, list[Any]]]]:
-    """Return the figure, and each panel with its labels."""
+def draw(trade_off: TradeOff) -> tuple[Any, list[tuple[Any, list[Mark], str, list[Any]]]]:
+    """Return the figure, and for each panel the axes, the marks, the unit of the cost and the labels."""
     quality, shown = trade_off.quality, (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
     made, axes = figure(len(shown), 1, *SIZE)
-    there = [point for point in trade_off.points if point.value(quality) is not None]
-    y_axis = Axis.of([point.value(quality) or 0.0 for point in there], worse=-1)
-    panels = []
-    for own, (cost, words, unit) in zip(axes.flat, shown, strict=True):
-        own.set_xlabel(f"{words}, {unit} ↓")
-        own.set_ylabel(f"{quality.column.title}, dB ↑")
-        x_axis = Axis.of([x for point in there if (x := point.value(COSTS[cost]))], True, worse=1)
-        panels.append(Panel(own, trade_off, COSTS[cost], unit, x_axis, y_axis))
-    scale = LARGEST / max([1.0, *(mark.gaussians for one in panels for mark in one.marks)])
-    for one in panels:
-        one.draw(scale)
+    marks = [_marks(trade_off, cost) for cost, _, _ in shown]
+    counts = [mark.gaussians for of in marks for mark in of if mark.gaussians]
+    scale = LARGEST / max([1.0, *counts])
+    presets = [point.preset for point in trade_off.points]
+    for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
+        panel.set_xlabel(f"{words}, {unit} ↓")
+        panel.set_ylabel(f"{quality.column.title}, dB ↑")
+        set_axis(panel.xaxis, [mark.x for mark in own], True, worse=1)
+        set_axis(panel.yaxis, [mark.y for of in marks for mark in of], worse=-1)
+        rivals = [m for m in own if m.role != "release" and m.point.preset not in trade_off.unranked]
+        _draw_front(panel, [(mark.x, mark.y) for mark in rivals])
+        for mark in own:
+            _draw(panel, trade_off, mark, COSTS[cost].column.title, scale, presets)
     look = {"title": _conditions(trade_off), "ncols": 8, "fontsize": 8, "title_fontsize": 8}
-    made.legend(handles=_handles(panels, scale), loc="outside lower center", **look)
+    made.legend(handles=_handles([mark for of in marks for mark in of], scale), loc="outside lower center", **look)
     lay_out(made, trade_off.title)
-    return made, [(one, one.label(scale)) for one in panels]
+    return made, [
+        (panel, own, unit, _label(panel, own, scale))
+        for panel, own, (_, _, unit) in zip(axes.flat, marks, shown, strict=True)
+    ]
 
 
-def area(gaussians: float, scale: float) -> float:
-    """Return the points^2 of a mark, with `scale` points^2 per Gaussian."""
-    return max(scale * gaussians, SMALLEST)
+@styled
+def time_chart(trade_off: TradeOff) -> Chart | None:
+    """Return held-out PSNR over training seconds, with a label where a run ends; None if no run has a log.
+
+    The axis of quality shows the range of the later halves of the runs (`axis.window`). Releases are dashed.
+    """
+    curves = _curves(trade_off)
+    if not curves:
+        return None
+    made, axes = figure(1, 1, *TIME_SIZE)
+    panel, presets, labels = axes[0, 0], [setting.preset for setting, _, _ in curves], []
+    set_axis(panel.xaxis, [s for _, seconds, _ in curves for s in seconds if s > 0], logarithmic=True)
+    low, high = set_axis(panel.yaxis, [v for _, _, psnr in curves for v in psnr[len(psnr) // 2 :]], worse=-1)
+    for setting, seconds, psnr in curves:
+        title, preset, role = setting.title, setting.preset, trade_off.role(setting.preset)
+        look = {"color": color_of(preset, presets), "alpha": ALPHA[role]} | LOOKS[role]
+        panel.plot(seconds, psnr, **look)
+        gid = tip(f"{title}\n{psnr[-1]:.2f} dB after {seconds[-1]:.0f} s")
+        panel.plot(seconds[-1], psnr[-1], **look, marker="o", markersize=2 * END_RADIUS, gid=gid)
+        if role != "release" and low <= psnr[-1] <= high:
+            text = methods.short(title, preset)
+            labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
+    panel.set_xlabel("training time in seconds, evaluations not counted")
+    panel.set_ylabel("PSNR of a held-out view, dB ↑")
+    title = f"{trade_off.title}\nquality over training time, dashed: as released"
+    lay_out(made, title)
+    ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
+    write_labels(panel, sorted(labels, key=lambda label: label.weight == "faint"), ends)
+    return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, trade_off.notes)
+
+
+def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]]]:
+    """Return seconds and PSNR of each setting, evaluation by evaluation, as means over its runs with a complete log."""
+    found = []
+    for setting in settings(trade_off.runs):
+        logs = [log for log in setting.runs["log"] if log["psnr"]]
+        count = max((len(log["psnr"]) for log in logs), default=0)
+        complete = [log for log in logs if len(log["psnr"]) == count]  # a run that was cut short would cut the mean
+        if complete:
+            seconds, psnr = (np.mean([log[name] for log in complete], 0).tolist() for name in ("seconds", "psnr"))
+            found.append((setting, seconds, psnr))
+    return found
+
+
+def _marks(trade_off: TradeOff, cost: str) -> list[Mark]:
+    """Return a mark for each point with a quality and a positive cost."""
+    numbers = [(point, point.value(COSTS[cost]), point.value(trade_off.quality)) for point in trade_off.points]
+    return [Mark(point, trade_off.role(point.preset), x, y) for point, x, y in numbers if x and y is not None]
+
+
+def _inside(panel: Any, mark: Mark) -> bool:
+    (left, right), (bottom, top) = panel.get_xlim(), panel.get_ylim()
+    return left <= mark.x <= right and bottom <= mark.y <= top
+
+
+def _area(mark: Mark, scale: float) -> float:
+    """Return points^2, with `scale` points^2 per Gaussian."""
+    return max(scale * mark.gaussians, SMALLEST) if mark.gaussians else FIXED
+
+
+def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, scale: float, presets: Sequence[str]) -> None:
+    """Draw a mark, with its standard deviation along both axes."""
+    color, numbers = color_of(mark.point.preset, presets), mark.point.numbers
+    x_std, y_std = numbers[cost].std, numbers[trade_off.quality.column.title].std
+    if x_std or y_std:
+        x_std = [[min(x_std or 0.0, 0.9 * mark.x)], [x_std or 0.0]]  # a logarithmic axis has no zero
+        look = {"color": color, "linewidth": 0.8, "alpha": 0.6 * ALPHA[mark.role], "zorder": 2}
+        panel.errorbar(mark.x, mark.y, yerr=y_std, xerr=x_std, linestyle="none", **look)
+    words = [f"{name}: {brief(cell.value, 4)}" for name, cell in numbers.items() if cell.value is not None]
+    look = {"alpha": ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
+    if mark.role == "release":
+        look |= {"facecolors": "none", "edgecolors": color, "linewidths": 1.0}
+    else:
+        ours = weight_of(mark.point.preset, mark.role) == "bold"
+        edge = {"edgecolors": INK[0], "linewidths": 1.2} if ours else {"edgecolors": PAPER[0], "linewidths": 0.5}
+        look |= {"facecolors": color, "marker": "o" if mark.gaussians else "D", **edge}
+    panel.scatter(mark.x, mark.y, s=_area(mark, scale), gid=tip("\n".join([mark.point.title, *words])), **look)
+
+
+def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
+    """Draw the Pareto front of points, up to the end of the axis."""
+    corners = pareto(points)
+    corners += [(max(panel.get_xlim()[1], corners[-1][0]), corners[-1][1])] if corners else []
+    steps = [*corners[:1], *(at for (_, y), (x, top) in pairwise(corners) for at in ((x, y), (x, top)))]
+    if steps:
+        panel.plot(*zip(*steps, strict=True), color=SOFT[0], linewidth=0.9, zorder=1.5)
+
+
+def _label(panel: Any, marks: Sequence[Mark], scale: float) -> list[Any]:
+    """Write labels, main presets first, and return the texts; call it when the layout is fixed."""
+    inside = [(mark, math.sqrt(_area(mark, scale)) / 2) for mark in marks if _inside(panel, mark)]
+    labels = [
+        Label(methods.short(m.point.title, m.point.preset), (m.x, m.y), radius, weight_of(m.point.preset, m.role))
+        for m, radius in sorted(inside, key=lambda of: of[0].role != "main")
+    ]
+    return write_labels(panel, labels, [(mark.x, mark.y, radius) for mark, radius in inside])
 
 
 def brief(value: float, digits: int = 3) -> str:
@@ -185,19 +202,7 @@ def brief(value: float, digits: int = 3) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.{digits}g}"
 
 
-def _look(mark: Mark, color: str) -> dict[str, Any]:
-    look: dict[str, Any] = {"alpha": ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
-    if any(mark.sides):  # an arrow head towards the true position
-        look["marker"] = (3, 0, math.degrees(math.atan2(mark.sides[1], mark.sides[0])) - 90)
-    elif mark.role != "release" and not mark.gaussians:
-        look["marker"] = "D"
-    if mark.role == "release":
-        return look | {"facecolors": "none", "edgecolors": color, "linewidths": 1.0}
-    ours = weight_of(mark.point.preset, mark.role) == "bold"
-    return look | {"facecolors": color, "edgecolors": INK[0] if ours else PAPER[0], "linewidths": 1.2 if ours else 0.5}
-
-
-def _handles(panels: Sequence[Panel], scale: float) -> list[Any]:
+def _handles(marks: Sequence[Mark], scale: float) -> list[Any]:
     """Return the legend of what is drawn."""
     from matplotlib.lines import Line2D
     from matplotlib.ticker import EngFormatter
@@ -206,18 +211,16 @@ def _handles(panels: Sequence[Panel], scale: float) -> list[Any]:
         look = {"marker": "o", "color": SOFT[0], "markeredgewidth": 0} | look
         return Line2D([], [], linestyle="none", markersize=math.sqrt(size), label=label, **look)
 
-    marks = [mark for one in panels for mark in one.marks]
     counts = [mark.gaussians for mark in marks if mark.gaussians]
     examples = dict.fromkeys((_round(min(counts)), _round(max(counts)))) if counts else ()
-    handles = [dot(area(count, scale), f"{EngFormatter(sep='')(count)} Gaussians") for count in examples]
-    if any(mark.role != "release" and not mark.gaussians and not any(mark.sides) for mark in marks):
+    sizes = {count: max(scale * count, SMALLEST) for count in examples}
+    handles = [dot(size, f"{EngFormatter(sep='')(count)} Gaussians") for count, size in sizes.items()]
+    if any(mark.role != "release" and not mark.gaussians for mark in marks):
         handles.append(dot(FIXED, "without Gaussians", marker="D"))
     if any(mark.role == "variant" for mark in marks):
         handles.append(dot(90.0, "variant of a method", alpha=ALPHA["variant"]))
     if any(mark.role == "release" for mark in marks):
         handles.append(dot(FIXED, "program as released", markerfacecolor="none", markeredgewidth=1.0))
-    if any(any(mark.sides) for mark in marks):
-        handles.append(dot(ARROW, "beyond the axis", marker="v"))
     return [*handles, Line2D([], [], color=SOFT[0], linewidth=0.9, label="Pareto front")]
 
 

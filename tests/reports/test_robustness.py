@@ -148,7 +148,7 @@ def test_files_and_page():
     assert heat_map.numbers is not None and len(heat_map.numbers) == 6
     assert scatter.numbers is not None and scatter.name == "robustness-synthetic-room-256x128"
     assert dict(scatter.numbers.set_index("preset")["score"])["omnigs"] == pytest.approx(0.575)
-    assert "| 0.00 [DIVERGED] |" in markdown(table) and "DIVERGED" in latex(table)
+    assert "| 0.00 \\[DIVERGED\\] |" in markdown(table) and "DIVERGED" in latex(table)
     html = page.html(run_set(runs()))
     assert 'id="stability"' in html and 'id="heat_maps"' in html
 

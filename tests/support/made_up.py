@@ -12,7 +12,6 @@ from PIL import Image
 from padgs import results
 from padgs.reports import published
 from padgs.reports.build import table
-from padgs.reports.charts.trade_off_chart import Panel
 from padgs.reports.frame import frame
 from padgs.reports.selection import Request, RunSet
 from padgs.reports.store import Run
@@ -204,9 +203,9 @@ def builder(name: str):
     return partial(table, name=name)
 
 
-def assert_apart(panel: Panel, texts: list[Any]) -> None:
+def assert_apart(panel: Any, texts: list[Any]) -> None:
     """No name in a panel touches another one or leaves the axes."""
     boxes = [text.get_window_extent() for text in texts]
-    inside = panel.axes.get_window_extent().padded(0.5)
+    inside = panel.get_window_extent().padded(0.5)
     assert all(inside.contains(*corner) for box in boxes for corner in (box.min, box.max))
     assert not any(first.overlaps(second) for n, first in enumerate(boxes) for second in boxes[:n])

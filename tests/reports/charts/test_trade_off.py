@@ -73,5 +73,3 @@ def test_roles_of_presets_and_corrected_methods_of_releases():
     roles = {preset: chart.role(preset) for preset in presets}
     assert {preset for preset, role in roles.items() if role == "release"} == {"odgs_release", "spags_release"}
     assert {preset for preset, role in roles.items() if role == "variant"} == {"padgs_ray"}
-    twins = {point.preset: twin.preset for point in chart.points if (twin := chart.corrected(point))}
-    assert twins == {"odgs_release": "odgs"}
