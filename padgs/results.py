@@ -248,9 +248,10 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     missing, unknown = known - document.keys(), document.keys() - known
     if missing or unknown:
         raise ResultError(f"{where}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
-    if digest != _digest(document):
-        raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
     try:
+        if digest != _digest(document):
+            raise ValueError("it was edited after it was written (SHA-256 differs)")
+        json.dumps(document, ensure_ascii=False).encode()  # refuses lone surrogates
         result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
         _refuse_other_types(result)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
@@ -284,6 +285,11 @@ def _refuse_other_types(result: Result) -> None:
         value = getattr(result, name)
         if not isinstance(value, kinds) or isinstance(value, bool):
             raise TypeError(f"{name} is {value!r}; it must be {' or '.join(kind.__name__ for kind in kinds)}")
+        if isinstance(value, int) and not 0 <= value < 2**63:
+            raise ValueError(f"{name} is {value}; it must be at least 0")
+    for name, value in result.timing.items():
+        if value is not None and not 0 <= value < math.inf:
+            raise ValueError(f"timing.{name} is {value}; it must be a time, at least 0")
     if not all(isinstance(name, str) for name in result.experiments):
         raise TypeError(f"experiments are {result.experiments!r}; they must be names")
     for name, count in result.counts.items():

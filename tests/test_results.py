@@ -101,6 +101,9 @@ def test_missing_and_unknown_keys_are_listed(result, tmp_path):
         ({"iterations": True}, "iterations is True"),
         ({"timing": 3}, "timing|items"),
         ({"timing": {"train_seconds": 10**400}}, "int too large"),
+        ({"timing": {"train_seconds": -1.0}}, "timing.train_seconds is -1.0; it must be a time, at least 0"),
+        ({"iterations_done": -5}, "iterations_done is -5; it must be at least 0"),
+        ({"reason": "\ud800"}, "surrogates not allowed"),
         ({"counts": {"gaussians": "many"}}, "counts.gaussians is 'many'"),
         ({"config": {"train": []}}, r"config.train is \[\]; it must be a group"),
         ({"config": {"budget": {"seconds": "long"}}}, "could not convert"),
@@ -116,6 +119,13 @@ def test_files_from_elsewhere_hold_names_and_numbers_where_they_should(result, t
     """A digest is no signature: whoever sends a file can make it fit."""
     with pytest.raises(ResultError, match=rf"result.json: .*({message})"):
         results.read(results.write(replace(result, **change), tmp_path))
+
+
+def test_a_bare_nan_leaves_its_file_out(result, tmp_path):
+    path = results.write(result, tmp_path)
+    path.write_text(path.read_text().replace("24.25", "NaN"))
+    with pytest.raises(ResultError, match=r"result.json: .*not JSON compliant"):
+        results.read(path)
 
 
 def test_a_file_that_is_nested_too_deep_is_named(tmp_path):

@@ -28,7 +28,7 @@ from rich.console import Console
 
 from padgs import results
 from padgs.checks import typed
-from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, Board, JobState, status_line
+from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, WAITING, Board, JobState, status_line
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
@@ -40,7 +40,8 @@ from padgs.runs.run import RETRIED
 from padgs.runs.store import RunStore, cannot_write, labels
 from padgs.runs.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 
-ATTEMPTS = 2  # of a job whose process died: another job may have caused it
+ATTEMPTS = 2  # of a job that began and whose process died: another job may have caused it
+IDLE_LAUNCHES = 5  # in a row in which no job began
 SECONDS_BETWEEN_TICKS = 1.0
 SECONDS_BETWEEN_LINES = 30.0  # without a terminal
 
@@ -106,7 +107,7 @@ class Multirun:
         """Launch the missing jobs, all or some at a time; if stopped from outside, running jobs write checkpoints."""
         if self.before and self.jobs:
             self._say(self.line())
-        waiting, attempts, launched = list(self.states), Counter[int](), 0
+        waiting, attempts, launched, idle = list(self.states), Counter[int](), 0, 0
         try:
             self.board.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -123,8 +124,10 @@ class Multirun:
             if self.board.stop_requested():
                 raise Interrupted("stopped, running jobs wrote their checkpoints")
             left = [index for index in batch if not self.states[index].ended]
-            attempts.update([index for index in left if self.states[index].status == RUNNING] or left)
-            lost = {index for index in left if self._in_process or attempts[index] >= ATTEMPTS}
+            attempts.update(index for index in left if self.states[index].status == RUNNING)
+            idle = idle + 1 if all(self.states[index].status == WAITING for index in batch) else 0
+            gives_up = self._in_process or idle >= IDLE_LAUNCHES
+            lost = {index for index in left if gives_up or attempts[index] >= ATTEMPTS}
             for index in lost:
                 status = REFUSED if self._in_process else KILLED
                 reason = f"a job ended without a status: {error or f'check the free space in {self.runs}'}"

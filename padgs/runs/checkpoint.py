@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -89,6 +90,7 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
     if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
         raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
     with understood(folder):
+        _refuse_impossible(manifest["values"])
         # Copies own aligned memory; products of views into the file's bytes may round differently.
         loaded = safetensors.torch.load(content)
         return State({name: tensor.to(device, copy=True) for name, tensor in loaded.items()}, manifest["values"])
@@ -104,6 +106,13 @@ def understood(folder: Path) -> Iterator[None]:
             raise
         reason = f"{type(error).__name__}: {error}"
         raise CheckpointError(f"{folder} holds no state of this method ({reason}); {WAY_OUT}") from error
+
+
+def _refuse_impossible(values: Mapping[str, Any]) -> None:
+    """Refuse numbers that no training leaves; a digest is no signature."""
+    for name, value in (*values.items(), *values.get("progress", {}).items()):
+        if isinstance(value, (int, float)) and not 0 <= value < math.inf:
+            raise ValueError(f"{name} is {value}; it must be at least 0 and finite")
 
 
 def _manifest(folder: Path) -> dict[str, Any]:

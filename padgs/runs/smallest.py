@@ -230,9 +230,10 @@ class Search:
         kept = self._trained(config, self._stop_requested)
         if self.run.scene.test:
             self._save_picture(self.run.folder / SMALLEST_PICTURE)
-        served = results.joined(self._result.experiments, (EXPERIMENT,))
         found = self.front() | {"kept": {"epsilon": epsilon, "run": kept.run}}
-        return self.run.files.finish(replace(self._result, smallest=found, experiments=served))
+        result = self.run.files.result() or self._result  # other commands may have added experiments or scores
+        served = results.joined(result.experiments, (EXPERIMENT,))
+        return self.run.files.finish(replace(result, smallest=found, experiments=served))
 
     def front(self) -> dict[str, Any]:
         """Return what the search found, for `Result.smallest`.

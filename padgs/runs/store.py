@@ -26,6 +26,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs import results
+from padgs.checks import check
 from padgs.evaluation.images import comparison_image
 from padgs.files import write_atomically
 from padgs.results import Result, decisive
@@ -59,6 +60,11 @@ class Progress:
     seconds: float = 0.0  # training time
     cpu_seconds: float = 0.0
     share: float = 0.0  # of the schedule
+
+    def __post_init__(self) -> None:
+        """Refuse what a forged checkpoint may hold."""
+        check(self, "an iteration, at least 0", lambda count: isinstance(count, int) and count >= 0, "iteration")
+        check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "share")
 
 
 class RunStore:

@@ -138,10 +138,24 @@ class NeverStarts(Start):
         raise RuntimeError("there is no such partition")
 
 
-def test_a_launcher_that_starts_nothing_is_retried_once(tmp_path, capsys):
+def test_a_launcher_that_starts_nothing_is_given_up(tmp_path, capsys):
     start = NeverStarts(tmp_path, 1, ELSEWHERE)
-    assert start.counts() == {"killed": 3} and len(start.launched) == 6
+    assert start.counts() == {"killed": 3} and len(start.launched) == 3 * sweep.IDLE_LAUNCHES
     assert capsys.readouterr().err.count("there is no such partition") == 1
+
+
+class DiesAtFirst(Start):
+    deaths = 3
+
+    def launch(self, jobs, initial_job_idx):
+        if self.deaths:
+            self.deaths -= 1
+            raise RuntimeError("a worker process was terminated")
+        super().launch(jobs, initial_job_idx)
+
+
+def test_deaths_of_workers_before_any_job_began_count_for_no_job(tmp_path):
+    assert DiesAtFirst(tmp_path, 1, ELSEWHERE).counts() == {"ok": 3}
 
 
 class Refuses(Start):
