@@ -26,10 +26,11 @@ from padgs.methods.splats.importance import GROWN_PER_KEPT
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
 from padgs.scene import Scene, View
+from padgs.training.corrections import LEARNED, LEARNED_FAST
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.method import Method
 from padgs.training.model import State
-from padgs.training.options import AUTO, TrainOptions
+from padgs.training.options import AUTO, Budget, TrainOptions
 
 PRUNE_PSNR = 44.0  # dB, with budget.gaussians=auto; see `padgs.methods.splats.importance.count_for_psnr`
 
@@ -84,6 +85,16 @@ class SplatMethod(Method):
             raise ValueError(
                 "method.positional_gradient=space_absolute is made for render.projection=ray, not "
                 f"{self.render_config.projection}; set method.positional_gradient=space"
+            )
+
+    def refuse_budget(self, budget: Budget) -> None:
+        """Also refuse pruning by importance from the given poses if the world of the model drifts away from them."""
+        super().refuse_budget(budget)
+        prunes = budget.gaussians == AUTO or self.options.prune_psnr is not None
+        if prunes and self.train_options.poses == LEARNED_FAST:
+            raise ValueError(
+                f"train.poses is {LEARNED_FAST}, but budget.gaussians={AUTO} and method.prune_psnr score Gaussians "
+                f"from the given poses; set train.poses={LEARNED}, or both to null"
             )
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:

@@ -1,6 +1,9 @@
 """Budgets of Gaussians, for all methods that have some."""
 
+from dataclasses import replace
+
 import pytest
+from support.composed import composed
 from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
@@ -23,9 +26,18 @@ def test_budget_auto_prunes_once_after_densification(name):
     assert after < before
 
 
-def test_budget_auto_is_refused_if_cameras_are_learned():
-    with pytest.raises(ValueError, match="budget.gaussians is auto.*set it to a number or null"):
-        lookup(METHODS, "sc_omnigs", "method")().refuse_budget(Budget(120, gaussians="auto"))
+@pytest.mark.parametrize(
+    ("settings", "budget"),
+    [
+        (("method=sc_omnigs",), Budget(120, gaussians="auto")),
+        (("method=spags_tuned", "train.poses=learned_fast"), Budget(120)),
+        (("method=padgs_plus", "train.poses=learned_fast"), Budget(120)),
+    ],
+)
+def test_pruning_from_poses_that_the_model_leaves_is_refused(settings, budget):
+    name, *overrides = settings
+    with pytest.raises(ValueError, match="score Gaussians from the given poses; set train.poses=learned"):
+        make_method(name.removeprefix("method="), *overrides).refuse_budget(budget)
 
 
 def test_budget_auto_works_with_learned_exposures():
@@ -33,3 +45,31 @@ def test_budget_auto_works_with_learned_exposures():
     method.refuse_budget(Budget(120, gaussians="auto"))
     with pytest.raises(ValueError, match="budget.stop is auto"):
         method.refuse_budget(Budget(120, stop="auto"))
+
+
+TUNED = {
+    **{"sh_degree": 2, "initial_per_pixel": 0.6, "depth_init_per_pixel": 0.6, "sky_per_point": 0.5},
+    **{"initial_opacity": 0.5, "initial_scale": 0.6, "means_rate_factor": 2.0, "prune_psnr": 44.0},
+}
+
+
+def test_spags_tuned_has_the_options_of_padgs_plus_that_any_method_could_have():
+    tuned, narrow, plus = (composed(f"method={name}") for name in ("spags_tuned", "spags_narrow", "padgs_plus"))
+    assert tuned.options == replace(narrow.options, **TUNED)
+    assert {name: getattr(plus.options, name) for name in TUNED} == TUNED
+    assert (tuned.train.weight, tuned.render.low_pass, tuned.render.blending) == ("solid_angle", 0.1, "sorted")
+    assert (tuned.train.weight, tuned.render) == (plus.train.weight, replace(plus.render, near_cull="ellipsoid"))
+
+
+@pytest.mark.parametrize("name", ["omnigs", "odgs", "op43dgs", "spags", "cubemap_3dgs", "sc_omnigs", "seam360gs"])
+def test_every_explicit_method_takes_the_options_of_padgs_plus(name):
+    given = "train.poses=given" if name == "sc_omnigs" else "seed=0"
+    options = [f"method.{key}={value}" for key, value in {**TUNED, "initial_per_pixel": 0.01}.items()]
+    method = make_method(name, *options, given)
+    records = list(method.fit(tiny_scene(), Budget(70)))
+    model = method.model
+    assert method.start > 0.01 * 2000 and (model.splats.means.norm(dim=-1) > 10).any(), "points and sky"
+    assert any("least important" in event for record in records for event in record.events)
+    assert model.splats.sh_rest.shape[1] == 8
+    rates = {group.name: group.learning_rate(0) for group in model.groups()}
+    assert rates["means"] == pytest.approx(2 * 1.6e-4 * method.options.extent_of(tiny_scene()))
