@@ -96,8 +96,10 @@ def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_F
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the names of all images below a folder, as in `file_names`."""
-    return [name for name in file_names(folder) if name.lower().endswith(EXTENSIONS)]
+    """Return the names of all images below a folder, as in `file_names`, without `a_mask.png` beside `a.jpg`."""
+    names = [name for name in file_names(folder) if name.lower().endswith(EXTENSIONS)]
+    masks = {f"{view_name(name)}_mask" for name in names}
+    return [name for name in names if view_name(name) not in masks]
 
 
 def file_names(folder: Path) -> list[str]:

@@ -20,6 +20,7 @@ from padgs.data.store import ImageStore, StoredImage
 from padgs.geometry.distortion import solid_angle_weight
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
+MASK_FOLDERS = ("masks", "mask")
 PREVIEW = "mask_preview.jpg"  # written beside them by `padgs.data.prepare.nadir`
 MIN_VISIBLE = 0.01  # of the sphere; with less, training has no signal and metrics are undefined
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
@@ -163,23 +164,30 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
             )
         return named, f"masks: those that {capture.format} names, for {len(named)} of {len(capture.frames)} views"
     if given is None:
-        given = next((capture.folder / file for file in SCENE_MASKS if (capture.folder / file).is_file()), None)
-        if given is None and (capture.folder / "masks").is_dir():
-            given = capture.folder / "masks"
-    if given is None:
-        return {}, None
+        usual = [capture.folder / name for name in SCENE_MASKS if (capture.folder / name).is_file()]
+        usual += [capture.folder / name for name in MASK_FOLDERS if (capture.folder / name).is_dir()]
+        given = next(iter(usual), capture.image_folder)
     if given.is_file():
         return {frame.name: given for frame in capture.frames}, f"mask: {given.name} for every view"
-    found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name)) is not None}
+    beside = given == capture.image_folder
+    found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside))}
+    if beside and not found:
+        return {}, None
     if not found:
-        raise DataError(f"{given} holds no mask named like an image (such as {capture.frames[0].name}.png)")
+        raise DataError(
+            f"{given} holds no mask named like an image (such as {capture.frames[0].name}.png); rename them, or set "
+            "data.mask=none"
+        )
     return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views"
 
 
-def _in_folder(folder: Path, name: str) -> Path | None:
-    """Return the mask of image `a.jpg`: `a.jpg.png` (COLMAP's convention), `a.png` or another image named `a`."""
+def _in_folder(folder: Path, name: str, beside_images: bool) -> Path | None:
+    """Return the mask of image `a.jpg`: `a.jpg.png` (COLMAP's convention), `a.png`, another image named `a`, or
+    `a_mask.png`, the only one that may be beside the image.
+    """
     stem = PurePosixPath(name).with_suffix("")
     candidates = [f"{name}.png", *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
+    candidates = [*([] if beside_images else candidates), *(f"{stem}_mask{extension}" for extension in EXTENSIONS)]
     return next((folder / file for file in candidates if (folder / file).is_file()), None)
 
 

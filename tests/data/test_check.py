@@ -77,7 +77,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "image missing": (lambda f: (f / "images/pano_02.png").unlink(), "1 of 6 poses have no image in .*: pano_02.png"),
     "image damaged": (
         lambda f: (f / "images/pano_02.png").write_bytes(b"\x89PNG\r\n\x1a\n"),
-        "pano_02.png is not an im",
+        "pano_02.png is a PNG file of a kind that is not read, or is damaged",
     ),
     "image truncated": (_truncate, "pano_02.png is cut short, although it has an end marker"),
     "not 2:1": (lambda f: _save(f, "images/pano_03.png", np.zeros((32, 60, 3), np.uint8)), "60x32, which is not 2:1"),
@@ -108,7 +108,10 @@ def test_all_problems_are_reported_at_once(world: World, tmp_path: Path) -> None
     for case in ("image damaged", "not 2:1", "lists overlap", "mask hides all"):
         BROKEN[case][0](tmp_path)
     problems = "\n".join(check(tmp_path).problems)
-    assert "pano_02.png is not an image" in problems and "pano_03.png is 60x32" in problems
+    assert (
+        "pano_02.png is a PNG file of a kind that is not read, or is damaged" in problems
+        and "pano_03.png is 60x32" in problems
+    )
     for name in ("pano_02", "pano_03"):
         _save(tmp_path, f"images/{name}.png", world.images[2])
     problems = "\n".join(check(tmp_path).problems)

@@ -53,6 +53,18 @@ def test_masks_per_image(spelling: str, folder: Path) -> None:
     assert views["pano_02"].mask() is None
 
 
+def test_folder_mask_and_masks_beside_images_are_used(folder: Path) -> None:
+    _mask(folder / "images" / "pano_02_mask.png", hidden_rows=16)
+    scene = load(folder)
+    views = {view.name: view for view in (*scene.train, *scene.test)}
+    assert views["pano_02"].mask().mean() == 0.5 and views["pano_00"].mask() is None
+    assert "masks: images/ for 1 of 6 views" in scene.notes and len(views) == 6
+    assert not any("no pose" in note for note in scene.notes)
+    _mask(folder / "mask" / "pano_00.png.png", hidden_rows=16)
+    scene = load(folder)
+    assert scene.train[0].mask().mean() == 0.5 and "masks: mask/ for 1 of 6 views" in scene.notes
+
+
 def test_grey_values_are_weights_and_rows_multiply(folder: Path) -> None:
     Image.fromarray(np.full((32, 64), 51, np.uint8)).save(folder / "weights.png")
     scene = load(folder, mask="weights.png")

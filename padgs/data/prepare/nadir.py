@@ -12,7 +12,7 @@ import padgs.data
 from padgs.data.assemble import image_folder
 from padgs.data.capture import DataError, listed
 from padgs.data.images import decode, inspect, save_png
-from padgs.data.masks import PREVIEW, SCENE_MASKS, row_weights
+from padgs.data.masks import MASK_FOLDERS, PREVIEW, SCENE_MASKS, row_weights
 from padgs.data.prepare.sources import mask_folder, panoramas
 
 MAX_WIDTH = 1024  # of the preview
@@ -71,9 +71,9 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
 
 def _refuse_other_masks(folder: Path) -> None:
     """Refuse a folder with per-image masks, of which only one kind would be read."""
-    if (folder / "masks").is_dir():
+    if found := next((folder / name for name in MASK_FOLDERS if (folder / name).is_dir()), None):
         raise DataError(
-            f"{folder / 'masks'} holds masks of single images, which mask.png would replace; mask the nadir in those "
+            f"{found} holds masks of single images, which mask.png would replace; mask the nadir in those "
             "files, or rename that folder"
         )
     try:

@@ -25,7 +25,7 @@ from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, lis
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
-from padgs.data.masks import write_masks
+from padgs.data.masks import MASK_FOLDERS, write_masks
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.sfm import image_pairs
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
@@ -77,7 +77,7 @@ def prepare(
             f"{destination} exists, and was not made of {source} with these options; nothing is overwritten: remove it "
             "or choose another path"
         )
-    if destination.name in (*IMAGE_FOLDERS, "masks") and destination.resolve().parent == source.resolve():
+    if destination.name in (*IMAGE_FOLDERS, *MASK_FOLDERS) and destination.resolve().parent == source.resolve():
         raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
     work = destination.absolute().with_name(f".{destination.name}.prepare")
     try:
