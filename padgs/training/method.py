@@ -21,7 +21,7 @@ from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
 from padgs.training.align import Similarity
 from padgs.training.corrections import FISHEYES, GIVEN, LEARNED_FAST, PoseRefinement
-from padgs.training.health import held_out, is_out_of_memory
+from padgs.training.health import is_out_of_memory, validation_folds
 from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer
 from padgs.training.model import Model, Prunable, Record, Refined, Size, State
@@ -98,8 +98,11 @@ class Method(ABC):
             known = None if self._loaded_state is None else self._loaded_state.values["schedule"]
             budget = replace(budget, iterations=known or self._schedule_length(scene, budget, lap))
         self._model = self._initial_model(scene, budget.iterations)
-        if self.train_options.hold_out:
-            scene = replace(scene, train=held_out(scene.train)[0])
+        if (fold := self.train_options.hold_out) is not None:
+            folds = validation_folds(scene.train)
+            if fold >= len(folds):
+                raise ValueError(f"train.hold_out is {fold}; the folds of this scene are 0 to {len(folds) - 1}")
+            scene = replace(scene, train=tuple(v for n, v in enumerate(scene.train) if n not in folds[fold]))
         if self.train_options.refine:
             refined: Any = Refined(self._model, self.train_options.learning_rates, budget.iterations)
             self._trainer = Trainer(refined, scene, budget, self.train_options, self.seed, stage=stage)

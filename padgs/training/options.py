@@ -90,7 +90,7 @@ class TrainOptions:
     # lenses apart along an axis of the camera, stitched as one; test views have one centre (Seam360GS).
     lens: str = GIVEN
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
-    hold_out: bool = False  # train without the validation views, see `padgs.training.health`
+    hold_out: int | None = None  # train without a fold of the views: `padgs.training.health.validation_folds`
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
@@ -101,3 +101,4 @@ class TrainOptions:
         else:
             check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "learning_rates")
         check(self, "at least 1", lambda every: every >= 1, "check_every")
+        check(self, "the number of a fold, from 0, or none", lambda fold: fold is None or fold >= 0, "hold_out")

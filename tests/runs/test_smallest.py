@@ -6,6 +6,7 @@ from statistics import mean
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from rich.console import Console
 from typer.testing import CliRunner
@@ -16,11 +17,14 @@ from padgs.cli.commands import app
 from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.results import SMALLEST_LOSSES, Scores
+from padgs.runs import candidates as rules
 from padgs.runs import smallest as search
+from padgs.runs.candidates import Candidate, band_shares, knee, loss, lower_bound, next_count, objections
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.run import Callback, run
-from padgs.runs.smallest import Candidate, Search, find_smallest, knee, loss, lower_bound, next_count, objections
-from padgs.training.health import held_out
+from padgs.runs.smallest import Search, find_smallest
+from padgs.scene import View
+from padgs.training.health import validation_folds
 
 SETTINGS = (
     *("train.iterations=60", "data.generator.width=48", "data.generator.train_views=8", "data.generator.test_views=2"),
@@ -33,14 +37,25 @@ def scores(*views: float, lpips: float | None = 0.1, **bands: float) -> Scores:
     """Scores of views with these WS-PSNRs, all bands alike except those that are given."""
     each: dict[str, dict[str, float | None]] = {
         str(number): {"ws_psnr": value, "ws_lpips_alex": lpips, "ws_lpips_vgg": lpips}
-        | {f"ws_psnr_{band}": value + bands.get(band, 0.0) for band in search.BANDS}
+        | {f"ws_psnr_{band}": value + bands.get(band, 0.0) for band in rules.BANDS}
         for number, value in enumerate(views)
     }
     return Scores({}, {"ws_psnr": mean(views), "ws_lpips_alex": lpips}, each)
 
 
-def candidate(rows: int, *views: float) -> Candidate:
-    return Candidate("", rows, rows, rows, 1.0, scores(*views), None, 0.0, 0.0)
+def candidate(rows: int, *views: float, test: float | None = None) -> Candidate:
+    return Candidate("", rows, rows, rows, 1.0, scores(*views), test, 0.0, 0.0)
+
+
+def view(mask: torch.Tensor | None = None) -> View:
+    return View("0", torch.eye(4, dtype=torch.float64), 96, 48, load_mask=None if mask is None else lambda: mask)
+
+
+SHARES = {str(number): band_shares(view()) for number in range(8)}
+
+
+def shares(count: int) -> dict[str, dict[str, float]]:
+    return {str(number): SHARES["0"] for number in range(count)}
 
 
 def searched(quality) -> list[Candidate]:
@@ -49,7 +64,7 @@ def searched(quality) -> list[Candidate]:
     count: int | None = 10_000
     while count is not None:
         found.append(candidate(count, *[quality(count)] * 3))
-        count = next_count(found, SMALLEST_LOSSES)
+        count = next_count(found, SMALLEST_LOSSES, shares(3))
         assert len(found) < 60, "the search ends"
     return found
 
@@ -64,7 +79,7 @@ def test_the_smallest_model_of_each_loss_is_found_within_a_fifth():
     )
     for epsilon in SMALLEST_LOSSES:
         true = min(rows for rows in range(100, 10_001) if lost(rows) < epsilon)
-        assert true <= search.smallest(found, epsilon).rows <= 1.2 * true + 1, epsilon
+        assert true <= rules.smallest(found, epsilon, shares(3)).rows <= 1.2 * true + 1, epsilon
     assert (bend := knee(found)) is not None and 3500 < bend.rows < 7500
 
 
@@ -72,7 +87,7 @@ def test_a_search_ends_at_few_rows_if_none_is_needed_and_keeps_all_if_all_are():
     found = searched(lambda rows: 30.0)
     assert 130 <= found[-1].rows < 190 and knee(found) is None
     found = searched(lambda rows: 30.0 - 100 * (rows < 10_000))
-    assert all(search.smallest(found, epsilon).rows == 10_000 for epsilon in SMALLEST_LOSSES)
+    assert all(rules.smallest(found, epsilon, shares(3)).rows == 10_000 for epsilon in SMALLEST_LOSSES)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +103,7 @@ def test_a_search_ends_at_few_rows_if_none_is_needed_and_keeps_all_if_all_are():
     ],
 )
 def test_each_rule_objects_by_name(changed, reasons):
-    found = objections(changed, scores(30.0, 30.0, 30.0), 0.1)
+    found = objections(changed, scores(30.0, 30.0, 30.0), 0.1, shares(3))
     assert len(found) == len(reasons) and all(map(str.startswith, found, reasons)), found
 
 
@@ -97,19 +112,52 @@ def test_the_bound_is_that_of_students_t():
     assert lower_bound([0.1, 0.0, -0.1]) == pytest.approx(-0.16859, abs=1e-5)
 
 
-def test_validation_views_are_spread_evenly_and_too_few_are_refused():
-    left, chosen = held_out(list(range(48)))  # type: ignore[arg-type]
-    assert chosen == (4, 12, 20, 28, 36, 44) and len(left) == 42
-    assert len(held_out(list(range(6)))[1]) == 3  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
-        held_out(list(range(5)))  # type: ignore[arg-type]
+def test_bands_count_by_what_masks_leave_of_them_and_small_ones_decide_nothing():
+    """With its nadir masked, `nadir` and half of `pole` are noise."""
+    whole, mask = band_shares(view()), torch.ones(48, 96)
+    mask[40:] = 0
+    masked = band_shares(view(mask))
+    assert whole["pole"] == pytest.approx(0.034, abs=2e-3) and whole["equator"] == pytest.approx(0.5, abs=0.02)
+    assert masked["nadir"] == 0 and masked["pole"] == pytest.approx(whole["pole"] / 2) and masked["zenith"] < 0.02
+    control, worse = scores(30.0, 30.0, 30.0), scores(30.0, 30.0, 30.0, nadir=-1.33, zenith=-1.0, pole=-0.6)
+    assert objections(worse, control, 0.1, shares(3)) == ("pole falls by 0.60 dB",)
+    assert objections(worse, control, 0.1, dict.fromkeys("012", masked)) == ()
+    of_one_view = scores(30.0, 30.0, 30.0)
+    of_one_view.views["0"]["ws_psnr_pole"] = 29.0
+    half = {**SHARES["0"], "pole": SHARES["0"]["pole"] / 10}
+    assert objections(of_one_view, control, 0.1, shares(3)) == ("pole falls by 0.33 dB",)
+    assert objections(of_one_view, control, 0.1, {**shares(3), "0": half}) == ()
+
+
+def test_the_interval_of_the_minimal_count_and_what_test_views_say():
+    found = [
+        candidate(1000, 30.0, 30.0, 30.0, test=29.0),
+        candidate(700, 30.0, 30.0, 30.0, test=28.95),  # surely as good
+        candidate(500, 30.1, 29.9, 29.8, test=28.92),  # perhaps
+        candidate(300, 29.5, 29.6, 29.5, test=28.8),  # surely not
+    ]
+    assert rules.smallest(found, 0.1, shares(3)).rows == 700
+    assert rules.smallest_possible(found, 0.1).rows == rules.smallest_by_test(found, 0.1).rows == 500
+    assert rules.smallest_by_test([candidate(10, 30.0, 30.0)], 0.1) is None
+
+
+@pytest.mark.parametrize(("views", "sizes"), [(8, [2, 2, 2, 2]), (24, [6, 6]), (31, [8]), (48, [12])])
+def test_a_quarter_of_the_views_and_at_least_eight_are_validation_views(views, sizes):
+    folds = validation_folds(list(range(views)))  # type: ignore[arg-type]
+    assert [*map(len, folds)] == sizes and len(set().union(*folds)) == sum(sizes) >= 8
+    assert {second - first for fold in folds for first, second in zip(fold, fold[1:], strict=False)} == {4}
+
+
+def test_fewer_views_than_eight_are_refused():
+    with pytest.raises(ValueError, match="7 training views are too few .* at least 8"):
+        validation_folds(list(range(7)))  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch, tmp_path):
     """Search few counts, without LPIPS."""
     monkeypatch.setattr(search, "RULES", search.TEST_RULES)
-    monkeypatch.setattr(search, "MIN_ROWS", 130)
+    monkeypatch.setattr(rules, "MIN_ROWS", 130)
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "cache"))
 
 
@@ -161,6 +209,9 @@ def test_a_search_writes_what_it_found_and_keeps_the_smallest_model_as_a_run(loa
     assert kept.score("sphere").metrics == pytest.approx(kept.scores["sphere"].metrics, nan_ok=True)
     assert np.array(Image.open(loaded.folder / "smallest.png")).shape == (24, 4 * 48, 3)
     assert "1 dB" in shown.get() and kept.folder.name in shown.get()
+    assert len(found["validation"]) == 8 and "Decided by 8 validation views" in " ".join(shown.get().split())
+    assert all(found["possible"][e] is not None and found["by_test"][e] is not None for e in found["minimal"])
+    assert "interval" in shown.get() and f"–{rows[found['minimal']['1']]}" in shown.get()
     candidates = sorted((loaded.folder / "smallest").glob("*/result.json"))
     written = [path.stat().st_mtime_ns for path in candidates]
     again = find_smallest(load(f"method={method}"), 0.1, Console(quiet=True)).smallest
@@ -193,7 +244,7 @@ def test_an_interrupted_search_resumes_to_the_same_candidates(load):
 
 def test_a_warm_start_prunes_the_least_important_rows_to_its_budget_and_refinement_keeps_their_number(load, tmp_path):
     folder = load("method=omnigs").folder
-    for more in ([], ["train.refine=true", "train.hold_out=true"]):
+    for more in ([], ["train.refine=true", "train.hold_out=3"]):
         settings = [*SETTINGS, "method=omnigs", f"init={folder}", "budget.gaussians=100", *more]
         with composing():
             config = configuration([*settings, f"run.folder={tmp_path}/{len(more)}"])
