@@ -250,10 +250,12 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
         raise ResultError(f"{where}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
     try:
         if digest != _digest(document):
-            raise ValueError("it was edited after it was written (SHA-256 differs)")
+            raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
         json.dumps(document, ensure_ascii=False).encode()  # refuses lone surrogates
         result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
         _refuse_other_types(result)
+    except ResultError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ResultError(f"{where}: {error}; delete it and run again") from error
     names = [result.run, result.method, result.preset, *result.experiments, *result.scores]
