@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -30,7 +31,20 @@ def check_known(options: object, **known: Collection[str]) -> None:
     for name, names in known.items():
         value = getattr(options, name)
         if value not in names:
-            raise ValueError(f"unknown {name} {value!r}; known: {', '.join(names)}")
+            raise ValueError(unknown(name, value, names))
+
+
+def unknown(what: str, name: object, known: Collection[str], meant: Sequence[str] = ()) -> str:
+    """Return an error message for a name that is none of the known ones, with those that may be meant.
+
+    By default, that is the most similar one.
+
+    >>> unknown("method", "padsg", ("padgs", "odgs"))
+    "unknown method 'padsg'; known: padgs, odgs; did you mean padgs?"
+    """
+    close = meant or difflib.get_close_matches(str(name), known, 1)
+    question = f"; did you mean {' or '.join(close)}?" if close else ""
+    return f"unknown {what} {name!r}; known: {', '.join(known)}{question}"
 
 
 # Least and greatest numbers by the name of their key or its last word, and for all others by type. Beyond them a number
@@ -50,6 +64,13 @@ LIMITS: dict[object, tuple[int, int]] = {
     float: (-(10**6), 10**6),
 }
 T = TypeVar("T")
+
+
+class Key(str):
+    """A dotted key of the configuration, shown without quotes."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
 
 
 class ConfigError(ValueError):
@@ -77,9 +98,9 @@ def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
     """
     hints = get_type_hints(kind)
     known = [field.name for field in fields(kind) if field.init]  # type: ignore[arg-type]
-    unknown = [key for key in values if key not in known]
-    if unknown:
-        raise ConfigError(f"unknown key {_join(where, unknown[0])}; known: {', '.join(_join(where, k) for k in known)}")
+    for key in values:
+        if key not in known:
+            raise ConfigError(unknown("key", Key(_join(where, key)), [_join(where, other) for other in known]))
     required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
     missing = [name for name in required if name not in values]
     if missing:

@@ -12,12 +12,13 @@ from pathlib import Path
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from padgs.apps.viewer.process import serve_training
+from padgs.checks import unknown
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.results import SMALLEST_STATED, Result
@@ -95,6 +96,10 @@ def exit_on_errors() -> Iterator[None]:
     """Exit with code 1 and the message of an expected error, without a traceback."""
     try:
         yield
+    except MissingConfigException as error:
+        group, _, name = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
+        complain(unknown(group, name, error.options or ()))
+        sys.exit(1)
     except HydraException as error:
         complain("\n".join(map(str, filter(None, (error, error.__cause__)))))
         sys.exit(1)

@@ -15,7 +15,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 
-from padgs.checks import install_command
+from padgs.checks import install_command, unknown
 
 SHOW = "--cfg"
 OPTIONS = ("-m", "--multirun", SHOW, "--help", "-h", "--version")
@@ -125,7 +125,7 @@ def problem(arguments: Sequence[str]) -> str | None:
     for before, argument in zip(["", *arguments], arguments, strict=False):
         key, equals, value = argument.partition("=")
         if argument.startswith("-") and argument not in OPTIONS:
-            return f"unknown option {argument}; known: {', '.join(OPTIONS)}"
+            return unknown("option", argument, OPTIONS)
         if argument in OPTIONS or before == SHOW:
             continue
         key = key.lstrip("+~")

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from padgs.baselines import METHODS
-from padgs.checks import ConfigError, check, check_known, typed
+from padgs.checks import ConfigError, Key, check, check_known, typed, unknown
 from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
@@ -204,8 +204,10 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
         ConfigError: an unknown key or name (the known ones are listed), or a value of the wrong type.
     """
     known = (*default_fields(), "method", "protocol")
-    if unknown := [key for key in values if key not in known]:
-        raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join(known)}")
+    for key in values:
+        if key not in known:
+            inner = [f"{group}.{key}" for group, keys in values.items() if isinstance(keys, Mapping) and key in keys]
+            raise ConfigError(unknown("key", Key(key), known, inner))
     name = str(_group(values, "method").get("name", DEFAULT_METHOD))
     if isinstance(values.get("init"), str):  # on the command line; config.yaml of runs has the fields of a WarmStart
         values = {**values, "init": asdict(WarmStart.of(values["init"], name))}

@@ -126,13 +126,15 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, argum
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("train.iteration=5", "unknown key train.iteration; known: train.lambda_l1"),
+        ("train.iteration=5", "; did you mean train.iterations?"),
         *(
             pytest.param(argument, message, marks=pytest.mark.slow)  # a process each
             for argument, message in (
                 ("sede=5", "unknown key sede; known: data, render"),
-                ("method=foo", "Available options in 'method'"),
-                ("+experiment=foo", "Available options in 'experiment'"),
+                ("method=omnigss", "did you mean omnigs?"),
+                ("iterations=5", "did you mean train.iterations?"),
+                ("method=foo", "unknown method 'foo'; known: crops_3dgs"),
+                ("+experiment=foo", "unknown experiment 'foo'; known: ablation"),
                 ("data.path=/no/such/folder", "/no/such/folder"),
                 ("protocol=null", "protocol is a group of settings, chosen by name"),
                 ("render.near=${nothing}", "Interpolation key 'nothing' not found"),
