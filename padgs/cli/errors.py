@@ -35,20 +35,22 @@ def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
         except (typer.Exit, BrokenPipeError):  # typer ends in silence where the reader of the output has ended
             raise
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            show(f"error: {error or 'out of memory'}{_hint(error, **options)}", sys.stderr)
+            show(f"error: {_message(error, **options)}", sys.stderr)
             raise typer.Exit(1) from error
 
     return wrapped
 
 
-def _hint(error: Exception, *, run: str = "", beside: str = "", data: str | None = None, **_: object) -> str:
-    """Return the way out of data of a run that cannot be used."""
+def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) -> str:
+    """Return the message of an error, with the way out of data of a run that cannot be used."""
     from padgs.data.capture import DataError
 
-    if not run or not isinstance(error, DataError):
-        return ""
-    runs = " or ".join(filter(None, (run, beside)))
-    return f"; it is the data of {runs}: if it has moved, name its place with --data"
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    if run and isinstance(error, DataError):
+        runs = " or ".join(filter(None, (run, beside)))
+        return f"{error}; it is the data of {runs}: if it has moved, name its place with --data"
+    return str(error) or "out of memory"
 
 
 def check_range(low: float, high: float, **options: float | None) -> None:
@@ -68,5 +70,6 @@ def name_place(place: Path, option: str = "--to") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or error
+        is_blocked = isinstance(error, FileExistsError)  # by a file where a folder must be
+        reason = f"{error.filename} is not a folder" if is_blocked else error.strerror or error
         raise ValueError(f"cannot write {place}: {reason}; name another place with {option}") from error

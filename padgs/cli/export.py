@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, check_range, name_place, show
+from padgs.cli.errors import DataPath, Run, check_range, name_place, printable, show
 
 LONG = 60.0  # seconds of writing; announced beforehand if it takes longer
 
@@ -35,6 +35,7 @@ def export(
     from pathlib import Path
 
     from rich.console import Console
+    from rich.text import Text
 
     from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run, point_cloud
     from padgs.apps.export.splat_file import check_suffix, estimate_seconds, write_splats
@@ -62,7 +63,7 @@ def export(
         )
         if not points and (seconds := estimate_seconds(path, found.splats)) > LONG:
             show(f"{path.name}: its harmonics take some {seconds / 60:.0f} minutes; a .spz or .ply takes seconds")
-        status.update(f"writing {path}")
+        status.update(Text(f"writing {printable(path.name)}"))
         with name_place(path):
             if points:
                 cloud = point_cloud(found.splats)

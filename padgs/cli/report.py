@@ -39,8 +39,10 @@ def report(
     if what not in (*REPORTS, ALL):
         raise ReportError(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
     source = Path(runs)
-    if not source.exists():
-        raise ReportError(f"there is no folder {source}; give the folder of the runs after the name of the report")
+    if not (source.is_dir() or source.is_file()):  # nor a device, which may have no end
+        raise ReportError(
+            f"there is no folder or file {source}; give the folder of the runs after the name of the report"
+        )
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from padgs.reports.frame import frame
     from padgs.reports.selection import Request, RunSet
@@ -76,7 +78,7 @@ def report(
             write_files(texts, target)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
-    print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
+    show(f"{len(found)} results, {len(broken)} left out; see {target}", sys.stderr)
     for warning in run_set.warnings:
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):

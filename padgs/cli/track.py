@@ -24,6 +24,8 @@ def track(
     found, broken = results.read_all(Path(runs))
     for error in broken:
         show(f"left out: {error}")
+    if not found:
+        raise ValueError(f"no finished run is in {runs}; give the folder of the runs")
     options, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
     for folder, result in found.items():
         experiment = " ".join(name for name in result.experiments if name != results.AD_HOC)
@@ -32,4 +34,4 @@ def track(
         trackers[experiment].update(folder)
         if not trackers[experiment].on:
             raise typer.Exit(1)
-    print(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")
+    show(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

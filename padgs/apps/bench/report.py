@@ -32,6 +32,7 @@ from typing import Any
 
 import torch
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 from padgs import clock
@@ -39,7 +40,7 @@ from padgs.apps.bench.ceilings import add_floors, measure_ceilings
 from padgs.apps.bench.stages import STAGES, WARM_UP, cpu_stages, device_stages
 from padgs.apps.bench.tile_counts import tiles_by_latitude
 from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, median_sigma
-from padgs.checks import check, check_known
+from padgs.checks import check, check_known, printable
 from padgs.files import check_place, write_atomically
 from padgs.native import cpu, cuda
 from padgs.render import Rendering, render
@@ -186,8 +187,9 @@ def lines(report: dict[str, Any]) -> Iterator[Table | str]:
         )
     else:
         yield f"Times that should agree differ by at most {max(0.0, noise['worst']):.0%}."
+    processor = escape(printable(machine["gpu"] or machine["cpu"]))
     yield (
-        f"{machine['gpu'] or machine['cpu']}, {machine['threads']} threads, compiled for {machine['compiled_for']}; "
+        f"{processor}, {machine['threads']} threads, compiled for {machine['compiled_for']}; "
         f"commit {(machine['commit'] or '?')[:10]}\nceilings of {'the GPU' if machine['gpu'] else 'one thread'}: "
         f"{ceilings['arithmetic'] / 1e9:.0f} GFLOP/s, {ceilings['memory'] / 1e9:.1f} GB/s"
     )

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from padgs.apps.viewer.server import LOCAL, PORT, start_server, viser_module
+from padgs.checks import printable
 from padgs.runs.interrupt import answer_signals
 
 if TYPE_CHECKING:
@@ -114,6 +115,6 @@ def wait_for_checkpoint(folder: str | Path) -> None:
         if not is_child and not files.is_busy and not is_decided():
             raise ValueError(f"{folder} has no checkpoint, and no process trains it; start the same padgs-run again")
         if not printed:
-            print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
+            print(f"waiting for the first checkpoint of {printable(str(folder))}  (Ctrl-C ends it)", flush=True)
         printed = True
         time.sleep(POLL_SECONDS)
