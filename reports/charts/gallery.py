@@ -1,8 +1,9 @@
-"""A test view of each scene: the ground truth, and the render of each method."""
+"""A test view of each scene: the ground truth, and the render of each method above its error."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from pandas import DataFrame
@@ -33,31 +34,45 @@ def charts(run_set: RunSet) -> list[Chart]:
         shared = sorted(set.intersection(*(set(render_names(folder)) for folder in own["renders"])))
         if shared and (images := _images(own, view := shared[len(shared) // 2])):
             name = file_name(f"gallery_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
-            title = f"{where}\ntest view {Path(view).stem}, with the PSNR of this view"
+            title = f"{where}\ntest view {Path(view).stem}, below each render its error, with the PSNR of this view"
             found.append(_sheet(name, title, images, tuple(footnotes({where: own}, run_set.request.protocol))))
     return found
 
 
 def _images(runs: DataFrame, view: str) -> list[tuple[str, Image.Image]]:
-    """Return titles and images of a view: ground truth, then renders by falling PSNR; none if no file can be read."""
+    """Return titles and images of a view: ground truth, then each render above its error, by falling PSNR.
+
+    There is none if no file can be read.
+    """
     truth, renders = None, []
     for run in runs.to_dict("records"):
         try:
-            truth, render, _ = split_image(run["renders"] / view, 3)
+            truth, *drawn = split_image(run["renders"] / view, 3)
         except OSError:
             continue  # an incomplete file of a killed run
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])
-        renders.append((math.inf, title, render) if psnr is None else (-psnr, f"{title}: {psnr:.2f} dB", render))
+        image = stacked(drawn)
+        renders.append((math.inf, title, image) if psnr is None else (-psnr, f"{title}: {psnr:.2f} dB", image))
     renders.sort(key=lambda one: one[0])
     return [] if truth is None else [("ground truth", truth), *((title, render) for _, title, render in renders)]
 
 
+def stacked(images: Sequence[Image.Image]) -> Image.Image:
+    """Return images of one size, each below the one before."""
+    width, height = images[0].size
+    sheet = Image.new("RGB", (width, height * len(images)))
+    for number, image in enumerate(images):
+        sheet.paste(image, (0, number * height))
+    return sheet
+
+
 @styled
 def _sheet(name: str, title: str, images: list[tuple[str, Image.Image]], notes: tuple[str, ...]) -> Chart:
-    made, axes = figure(COLUMNS, math.ceil(len(images) / COLUMNS), 3.9, 2.2)
+    made, axes = figure(COLUMNS, math.ceil(len(images) / COLUMNS), 3.9, 4.2)
     for panel in axes.flat:
         panel.set(xticks=[], yticks=[])  # hidden axes reserve space for their labels
         panel.set_axis_off()
+        panel.set_anchor("N")
     for panel, (words, image) in zip(axes.flat, images, strict=False):
         show_image(panel, image, words)
     lay_out(made, title)

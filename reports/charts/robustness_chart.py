@@ -21,41 +21,56 @@ STATUS_LETTERS = {
 }
 COLORS = "cividis"  # dark where nothing is left; readable for colour-blind readers
 LIGHT, DARK = "#fafafa", "#101010"  # numbers on dark and on bright cells
-WIDTH, HEIGHT, BORDER = 0.46, 0.36, (2.3, 2.2)  # inches of a cell, and beside and above all cells
+LEVEL = 2  # of stress; 1 is mild, 3 is severe
+WIDTH, HEIGHT, BORDER = 0.8, 0.34, (1.8, 1.9)  # inches of a cell, and beside and above all cells
+NARROWEST, WIDEST = 5.2, 13.5  # inches of a heat map; 1500 pixels at most
 AREA = 160.0  # points^2 of a mark
 
 
 @styled
 def heat_map(title: str, stressed: Sequence[StressedMethod]) -> Chart:
-    """Return a row per method and a column per condition: retention as colour, failures as letters."""
-    stresses = all_stress(stressed)
-    made, axes = figure(1, 1, BORDER[0] + WIDTH * len(stresses), BORDER[1] + HEIGHT * len(stressed))
+    """Return a row per condition at `LEVEL` and a column per method that was run under all of them.
+
+    Retention is shown as colour, failures as letters. Without a run at that level, the mildest one is shown; if no
+    method is complete, all are.
+    """
+    levels = {level for _, level in all_stress(stressed)}
+    level = LEVEL if LEVEL in levels else min(levels)
+    stresses = [stress for stress in all_stress(stressed) if stress[1] == level]
+    complete = [one for one in stressed if not {*stresses} & one.missing]
+    shown = complete or [one for one in stressed if {*stresses} & one.runs.keys()]
+    width = min(WIDTH, (WIDEST - BORDER[0]) / len(shown))
+    made, axes = figure(1, 1, max(BORDER[0] + width * len(shown), NARROWEST), BORDER[1] + HEIGHT * len(stresses))
     own, rows, linked = axes[0][0], [], False
-    for row, one in enumerate(stressed):
-        for column, stress in enumerate(stresses):
+    for column, one in enumerate(shown):
+        for row, stress in enumerate(stresses):
             if (cell := one.robustness.get(stress)) is not None:
                 url = _worst_view(one.runs[stress])
                 linked = linked or url is not None
                 _draw_cell(own, column, row, cell, _cell_tip(one, stress, cell), url)
-                where = {"scene": title, "preset": one.preset, "condition": stress[0], "level": stress[1]}
+                where = {"scene": title, "preset": one.preset, "condition": stress[0], "level": level}
                 rows.append({**where, **cell.numbers})
-    own.set_xlim(0, len(stresses))
-    own.set_ylim(len(stressed), 0)
-    names = [f"{name} {level}" for name, level in stresses]
-    own.set_xticks([n + 0.5 for n in range(len(stresses))], names, rotation=60, ha="left")
+    own.set_xlim(0, len(shown))
+    own.set_ylim(len(stresses), 0)
+    titles = [methods.short(methods.title(one.preset), one.preset) for one in shown]
+    own.set_xticks([n + 0.5 for n in range(len(shown))], titles, rotation=40, ha="left")
     own.xaxis.tick_top()
-    titles = [methods.short(methods.title(one.preset), one.preset) for one in stressed]
-    own.set_yticks([n + 0.5 for n in range(len(stressed))], titles)
+    own.set_yticks([n + 0.5 for n in range(len(stresses))], [name for name, _ in stresses])
     own.tick_params(length=0)
     own.grid(False)
     own.spines[:].set_visible(False)
-    seen = {status for one in stressed for cell in one.robustness.values() for status in cell.status.split()}
+    seen = {
+        status for one in shown for of in stresses if of in one.runs for status in one.robustness[of].status.split()
+    }
     letters = ", ".join(f"{letter} {status}" for status, letter in STATUS_LETTERS.items() if status in seen)
-    own.set_xlabel(f"1: keeps everything, 0: one colour{f'; {letters}' if letters else ''}", fontsize=8)
-    lay_out(made, f"What methods keep under stress\n{title}")
-    notes = ("Each cell: the distance to one colour, as a share of the method's own without stress.",)
-    notes += ("A cell opens its worst view, truth | render | error, if the folder of the run has it.",) * linked
-    return Chart(f"stability-{stressed[0].place}", title, made, notes, DataFrame(rows))
+    own.set_xlabel(f"1: keeps everything, 0: one colour{f'; {letters}' if letters else ''}")
+    lay_out(made, f"What methods keep under stress of level {level}\n{title}")
+    notes = ["Each cell: the distance to one colour, as a share of the method's own without stress."]
+    if linked:
+        notes.append("A cell opens its worst view, truth | render | error, if the folder of the run has it.")
+    if left_out := [methods.title(one.preset) for one in stressed if one not in shown]:
+        notes.append(f"Not run under all conditions, and so left out: {', '.join(left_out)}.")
+    return Chart(f"stability-{stressed[0].place}", title, made, tuple(notes), DataFrame(rows))
 
 
 @styled
@@ -111,7 +126,7 @@ def _draw_cell(axes: Any, column: int, row: int, cell: Cell, text: str, url: str
     letters = "".join(STATUS_LETTERS[status] for status in cell.status.split())
     look = {"color": DARK if value > 0.55 else LIGHT, "fontweight": "bold" if letters else "normal", "url": url}
     shown, middle = letters or f"{value:.2f}".lstrip("0"), (column + 0.5, row + 0.5)
-    axes.text(*middle, shown, ha="center", va="center_baseline", fontsize=8, **look)
+    axes.text(*middle, shown, ha="center", va="center_baseline", fontsize=10, **look)
 
 
 def _cell_tip(one: StressedMethod, stress: Stress, cell: Cell) -> str:

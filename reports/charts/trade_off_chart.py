@@ -14,7 +14,7 @@ from padgs.reports import methods
 from padgs.reports.charts.axis import set_axis
 from padgs.reports.charts.drawing import ALPHA, INK, PAPER, SOFT, Chart, color_of, figure, lay_out, styled, tip
 from padgs.reports.charts.labels import Label, weight_of, write_labels
-from padgs.reports.charts.trade_off import Point, TradeOff, pareto, trade_offs
+from padgs.reports.charts.trade_off import Point, TradeOff, equal_times, pareto, trade_offs
 from padgs.reports.measures import COSTS
 from padgs.reports.selection import RunSet, Setting, settings
 
@@ -27,6 +27,7 @@ LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line ove
     "variant": {"linewidth": 0.9, "zorder": 2.1},
     "release": {"linewidth": 0.7, "zorder": 2.0, "linestyle": (0, (4, 2))},
 }
+NAMED, DIP = 5, 0.5  # names in a chart over time; dB of a dip that is left out
 END_RADIUS = 2.5  # points, of the mark at the end of a run
 
 
@@ -51,13 +52,18 @@ def charts(run_set: RunSet) -> list[Chart]:
     return [drawn for drawn in made if drawn is not None]
 
 
-def chart(trade_off: TradeOff) -> Chart:
-    """Return two panels with a common axis of quality and a label at each mark.
+def equal_time_charts(run_set: RunSet) -> list[Chart]:
+    """Return quality over time per frame after the same training time, for each scene, resolution and training time."""
+    return [chart(trade_off, (FRAME_TIME,)) for trade_off in equal_times(run_set)]
+
+
+def chart(trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()) -> Chart:
+    """Return panels with a common axis of quality and a label at each mark, by default of training and of frame time.
 
     Axes show where methods differ (`axis.window`); a note names the marks beyond. The area of a mark is proportional to
     the number of Gaussians. Releases are small rings, and not in the Pareto front. Variants are faint.
     """
-    made, panels = draw(trade_off)
+    made, panels = draw(trade_off, shown)
     beyond = {
         f"{mark.point.title} ({mark.y:.1f} dB, {brief(mark.x)} {unit})"
         for axes, marks, unit, _ in panels
@@ -69,9 +75,12 @@ def chart(trade_off: TradeOff) -> Chart:
 
 
 @styled
-def draw(trade_off: TradeOff) -> tuple[Any, list[tuple[Any, list[Mark], str, list[Any]]]]:
+def draw(
+    trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()
+) -> tuple[Any, list[tuple[Any, list[Mark], str, list[Any]]]]:
     """Return the figure, and for each panel the axes, the marks, the unit of the cost and the labels."""
-    quality, shown = trade_off.quality, (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
+    quality = trade_off.quality
+    shown = shown or (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
     made, axes = figure(len(shown), 1, *SIZE)
     marks = [_marks(trade_off, cost) for cost, _, _ in shown]
     counts = [mark.gaussians for of in marks for mark in of if mark.gaussians]
@@ -99,7 +108,8 @@ def draw(trade_off: TradeOff) -> tuple[Any, list[tuple[Any, list[Mark], str, lis
 def time_chart(trade_off: TradeOff) -> Chart | None:
     """Return held-out PSNR over training seconds, with a label where a run ends; None if no run has a log.
 
-    The axis of quality shows the range of the later halves of the runs (`axis.window`). Releases are dashed.
+    The axis of quality shows the range of the later halves of the runs (`axis.window`). Releases are dashed. The best
+    `NAMED` settings have names; dips after resets of opacities are left out.
     """
     curves = _curves(trade_off)
     if not curves:
@@ -119,10 +129,11 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
             labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
     panel.set_xlabel("training time in seconds, evaluations not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
-    title = f"{trade_off.title}\nquality over training time, dashed: as released"
+    title = f"{trade_off.title}\nquality over training time, without dips after resets; dashed: as released"
     lay_out(made, title)
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
-    write_labels(panel, sorted(labels, key=lambda label: label.weight == "faint"), ends)
+    labels.sort(key=lambda label: (label.weight == "faint", -label.at[1]))
+    write_labels(panel, labels[:NAMED], ends)
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, trade_off.notes)
 
 
@@ -135,8 +146,20 @@ def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]
         complete = [log for log in logs if len(log["psnr"]) == count]  # a run that was cut short would cut the mean
         if complete:
             seconds, psnr = (np.mean([log[name] for log in complete], 0).tolist() for name in ("seconds", "psnr"))
-            found.append((setting, seconds, psnr))
+            found.append((setting, *without_dips(seconds, psnr)))
     return found
+
+
+def without_dips(seconds: Sequence[float], psnr: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Leave out points more than `DIP` below both an earlier and a later one, as after a reset of opacities.
+
+    >>> without_dips([1, 2, 3, 4], [20.0, 12.0, 21.0, 18.0])
+    ([1, 3, 4], [20.0, 21.0, 18.0])
+    """
+    before = np.maximum.accumulate(psnr)
+    after = np.maximum.accumulate(psnr[::-1])[::-1]
+    kept = [n for n, value in enumerate(psnr) if min(before[n], after[n]) - value <= DIP]
+    return [seconds[n] for n in kept], [psnr[n] for n in kept]
 
 
 def _marks(trade_off: TradeOff, cost: str) -> list[Mark]:

@@ -141,11 +141,17 @@ def test_every_status_has_a_letter_of_its_own():
 
 
 def test_files_and_page():
-    table, heat_map, scatter = stability(run_set(runs()))
+    complete = [
+        run("spags", 22.0),
+        run("spags", 0.0, "pose_noise", 2, status="diverged"),
+        run("spags", 20.0, "seam", 2),
+    ]
+    table, heat_map, scatter = stability(run_set([*runs(), *complete]))
     assert heat_map.name == "stability-synthetic-room-256x128"
     assert "pose_noise 2: keeps 0.40; WS-PSNR 16.00 dB, 22.00 without" in heat_map.svg and ">V<" in heat_map.svg
     assert "V diverged" in heat_map.svg and "exploded" not in heat_map.svg and heat_map.png.startswith(b"\x89PNG")
-    assert heat_map.numbers is not None and len(heat_map.numbers) == 6
+    assert heat_map.numbers is not None and [*heat_map.numbers["preset"].unique()] == ["omnigs", "spags"]
+    assert {*heat_map.numbers["level"]} == {2} and "left out: PaD-GS." in heat_map.notes[-1]
     assert scatter.numbers is not None and scatter.name == "robustness-synthetic-room-256x128"
     assert dict(scatter.numbers.set_index("preset")["score"])["omnigs"] == pytest.approx(0.575)
     assert "| 0.00 \\[DIVERGED\\] |" in markdown(table) and "DIVERGED" in latex(table)

@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.made_up import assert_apart, compared, run_set, small, write
+from support.made_up import assert_apart, compared, of_experiment, run_set, small, write
 
 from padgs.reports import store
+from padgs.reports.charts import trade_off_chart
 from padgs.reports.charts.trade_off import trade_offs
-from padgs.reports.charts.trade_off_chart import LARGEST, chart, charts, draw, time_chart
+from padgs.reports.charts.trade_off_chart import LARGEST, NAMED, chart, charts, draw, equal_time_charts, time_chart
 from padgs.reports.frame import frame
 from padgs.reports.methods import short
 from padgs.reports.selection import RunSet
@@ -84,11 +85,25 @@ def test_a_mark_has_a_tooltip_with_its_numbers():
     assert ">time per frame, ms ↓<" in made.svg and made.png.startswith(b"\x89PNG")
 
 
-def test_quality_over_training_time_comes_from_the_logs(tmp_path):
+def test_after_equal_time_only_the_time_per_frame_is_a_cost():
+    budget = {"seconds": 60.0, "clock": "cpu"}
+    runs = [
+        replace(run := of_experiment("equal_time", 25.0, preset=method), config=run.config | {"budget": budget})
+        for method in ("odgs", "omnigs", "spags")
+    ]
+    (made,) = equal_time_charts(run_set(runs))
+    assert made.name == "equal_time_synthetic-room_512x256_60-s-of-CPU-time" and len(made.figure.axes) == 1
+    assert ">time per frame, ms ↓<" in made.svg and equal_time_charts(run_set(runs[:2])) == []
+
+
+def test_quality_over_training_time_comes_from_the_logs(tmp_path, monkeypatch):
+    named = []
+    monkeypatch.setattr(trade_off_chart, "write_labels", lambda _, labels, __: named.append(labels))
     runs = compared(["synthetic-room"], seeds=2)
     runs.append(replace(small(20.0, method="mine", experiments=("all_methods",)), status="oom"))
     (logged,) = trade_offs(RunSet(frame(store.read(write(runs, tmp_path))[0])))
     made = time_chart(logged)
-    assert made.name == "time_synthetic-room" and ">PaD-GS<" in made.svg and ">mine<" in made.svg
+    assert made.name == "time_synthetic-room" and "PaD-GS" in {label.text for label in named[0]}
+    assert len(logged.points) > NAMED == len(named[0])
     assert "<title>PaD-GS\n25.52 dB after 200 s</title>" in made.svg  # 26.05 of two seeds - 8 / 15 at the last probe
     assert time_chart(one(runs)) is None, "no quality over time without a log"
