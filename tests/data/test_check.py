@@ -17,12 +17,13 @@ from typer.testing import CliRunner
 
 from padgs.cli import check as check_command
 from padgs.cli import convert as convert_command
+from padgs.cli.errors import without_traceback
 from padgs.data import load
 from padgs.data.check import check
 
 app = Typer()
-app.command()(check_command.check)
-app.command()(convert_command.convert)
+app.command()(without_traceback(check_command.check))
+app.command()(without_traceback(convert_command.convert))
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -8,13 +8,13 @@ one unit per metre unless `world_scale` changes that.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import fields
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from padgs.checks import ConfigError, typed
 from padgs.data.capture import DataError, DataOptions
 from padgs.data.store import ImageStore, StoredImage
 from padgs.data.synthetic import cache, camera, paths
@@ -38,12 +38,11 @@ def load(path: str | Path, options: DataOptions) -> Scene:
         settings["scene"] = str(path)
     if options.width is not None:
         settings["width"] = options.width
-    known = [field.name for field in fields(SyntheticOptions)]
-    for name in settings:
-        if name not in known:
-            raise DataError(f"unknown data.generator.{name}; known: {', '.join(sorted(known))}")
-    store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device)
-    return generate(SyntheticOptions(**settings), store)
+    try:
+        scene = typed(SyntheticOptions, settings, "data.generator")
+    except ConfigError as error:
+        raise DataError(str(error)) from error
+    return generate(scene, ImageStore(options.cache_bytes, options.prefetch_threads, options.device))
 
 
 def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scene:

@@ -14,14 +14,20 @@ SCENES = (
     *("white_room", "checker_room", "room_chain"),
 )
 PATHS = ("roaming", "cross", "line")
+MAX_WIDTH, MAX_VIEWS, MAX_PIXELS = 16384, 10_000, 2_000_000_000
 HEADINGS = ("path", "fixed", "random")
 
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
-    ("width", lambda x: x >= 8 and x % 2 == 0, "an even number >= 8, as a panorama is 2:1 (set data.width)"),
-    ("samples", lambda x: x >= 1 and math.isqrt(x) ** 2 == x, "a square number: 1, 4, 9, 16, 25, ..."),
-    ("train_views", lambda x: x >= 2, "at least 2"),
-    ("test_views", lambda x: x >= 0, "at least 0"),
-    ("points spokes", lambda x: x >= 1, "at least 1"),
+    (
+        "width",
+        lambda x: 8 <= x <= MAX_WIDTH and x % 2 == 0,
+        f"an even number from 8 to {MAX_WIDTH}, as a panorama is 2:1 (set data.width)",
+    ),
+    ("samples", lambda x: 1 <= x <= 1024 and math.isqrt(x) ** 2 == x, "a square number: 1, 4, 9, 16, 25, ... 1024"),
+    ("train_views", lambda x: 2 <= x <= MAX_VIEWS, f"at least 2 and at most {MAX_VIEWS}"),
+    ("test_views", lambda x: 0 <= x <= MAX_VIEWS, f"at least 0 and at most {MAX_VIEWS}"),
+    ("points", lambda x: 1 <= x <= 10**8, "at least 1 and at most 100 million"),
+    ("spokes", lambda x: x >= 1, "at least 1"),
     (
         "point_noise pose_noise_translation pose_noise_rotation tilt lens_gap",
         lambda x: 0 <= x < math.inf,
@@ -79,6 +85,13 @@ class SyntheticOptions:
             for name in names.split():
                 if not is_valid(value := getattr(self, name)):
                     raise DataError(f"data.generator.{name} is {value}; it must be {rule}")
+        pixels = (self.train_views + self.test_views) * self.width * self.height
+        if pixels > MAX_PIXELS:
+            raise DataError(
+                f"{self.train_views + self.test_views} views of {self.width}x{self.height} are {pixels / 1e9:.1f} "
+                f"billion pixels, and at most {MAX_PIXELS / 1e9:g} are generated; lower data.width, "
+                "data.generator.train_views or test_views"
+            )
         if self.rooms is not None and (self.scene != "room_chain" or self.rooms < 1):
             raise DataError(
                 f"rooms is {self.rooms} of scene {self.scene}; only room_chain has this option, which must be 1 or "

@@ -87,7 +87,7 @@ def test_load_uses_the_data_options():
     scene = load("outdoor", DataOptions(width=32, generator={"train_views": 3, "test_views": 1, "points": 100}))
     assert scene.name == "synthetic-outdoor"
     assert (len(scene.train), scene.train[0].width, scene.train[0].height) == (3, 32, 16)
-    with pytest.raises(DataError, match=r"unknown data.generator.wdith; known: .*train_views.*width"):
+    with pytest.raises(DataError, match=r"unknown key data.generator.wdith; known: .*width.*train_views"):
         load("room", DataOptions(generator={"wdith": 3}))
     with pytest.raises(DataError, match="unknown synthetic scene 'rom'; known: bare_room, .*room"):
         load("rom", DataOptions())
@@ -97,6 +97,10 @@ def test_load_uses_the_data_options():
     ("settings", "message"),
     [
         ({"width": 15}, "even number"),
+        ({"width": 10**9}, "width is 1000000000; it must be an even number from 8 to 16384"),
+        ({"train_views": 10**9}, "train_views is 1000000000; it must be .* at most 10000"),
+        ({"width": 8192, "train_views": 500}, "506 views of 8192x4096 are 17.0 billion pixels, and at most 2 are"),
+        ({"points": 10**12}, "points is 1000000000000; it must be .* at most 100 million"),
         ({"samples": 5}, "square number"),
         ({"train_views": 1}, "train_views is 1; it must be at least 2"),
         ({"outliers": 1.0}, "share"),
@@ -114,6 +118,18 @@ def test_load_uses_the_data_options():
 def test_invalid_options_are_refused(settings, message):
     with pytest.raises(DataError, match=message):
         SyntheticTruth(SyntheticOptions(**settings))
+
+
+INTEGERS = ("width", "train_views", "test_views", "samples", "points", "seed", "objects", "rooms", "spokes")
+
+
+@pytest.mark.parametrize("name", INTEGERS)
+@pytest.mark.parametrize("value", [8.5, "many", True, [1], 10**9, -(10**12)])
+def test_values_of_other_types_or_beyond_the_limits_are_refused(name, value):
+    """An integer written as a float is one."""
+    if not (name == "seed" and value == 10**9):
+        with pytest.raises(DataError, match=f"data.generator.{name} is"):
+            load("room_chain", DataOptions(generator={name: value}))
 
 
 def depths(name, width=128, **settings):
