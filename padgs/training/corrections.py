@@ -172,15 +172,9 @@ class Corrections(nn.Module):
         """Begin without corrections.
 
         Raises:
-            ValueError: poses are learned, but two views have the same name, or all stand in one place; a lens is
-                learned, but of no panorama.
+            ValueError: poses are learned, but two views have the same name; a lens is learned, but of no panorama.
         """
         super().__init__()
-        if options.poses == LEARNED_FAST and scene.has_single_center:
-            raise ValueError(
-                f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
-                f"scale to carry held-out views by; set train.poses={LEARNED} or {GIVEN}"
-            )
         self._options = options
         views = len(scene.train) if options.exposures == LEARNED else 0
         self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))

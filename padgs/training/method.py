@@ -20,7 +20,7 @@ from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
 from padgs.training.align import Similarity
-from padgs.training.corrections import FISHEYES, GIVEN, LEARNED_FAST, PoseRefinement
+from padgs.training.corrections import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, PoseRefinement
 from padgs.training.health import is_out_of_memory, validation_folds
 from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer
@@ -90,6 +90,11 @@ class Method(ABC):
         lap = Lap()
         if not scene.train:
             raise ValueError(f"scene {scene.name!r} has no training view; correct its split")
+        if self.train_options.poses == LEARNED_FAST and scene.has_single_center:
+            raise ValueError(
+                f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
+                f"scale to carry held-out views by; set train.poses={LEARNED} or {GIVEN}"
+            )
         self.refuse_budget(budget)
         if self.train_options.refine and self._warm_start_state is None and self._loaded_state is None:
             raise ValueError("train.refine refines the model of a finished run; set init=RUN, or train.refine=false")

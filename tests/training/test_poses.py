@@ -5,10 +5,11 @@ import pytest
 import torch
 from support.tiny_scene import tiny_scene, truth
 
+from padgs.baselines.sc_omnigs import SCOmniGSMethod
 from padgs.render import RenderOptions, render
 from padgs.training.align import Similarity, align
-from padgs.training.corrections import Corrections, PoseRefinement
-from padgs.training.options import TrainOptions
+from padgs.training.corrections import PoseRefinement
+from padgs.training.options import Budget
 
 VIEWS = tiny_scene().train
 
@@ -130,4 +131,8 @@ def test_alignment_finds_a_similarity_and_maps_poses_by_it(generator):
 def test_views_in_one_place_have_no_scale_to_follow():
     views = tuple(replace(view, cam_from_world=torch.eye(4, dtype=torch.float64)) for view in VIEWS)
     with pytest.raises(ValueError, match="the 5 training cameras of scene .* stand in one place, which has no scale"):
-        Corrections(replace(tiny_scene(), train=views), TrainOptions(poses="learned_fast"))
+        SCOmniGSMethod().fit(replace(tiny_scene(), train=views), Budget(10))
+
+
+def test_budgets_of_seconds_are_measured_on_one_view_of_many_places():
+    assert list(SCOmniGSMethod().fit(tiny_scene(), Budget(1, seconds=0.5)))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 from support.composed import composed
 from support.tiny_scene import tiny_scene
 
@@ -64,11 +65,16 @@ def test_spags_tuned_has_the_options_of_padgs_plus_that_any_method_could_have():
 @pytest.mark.parametrize("name", ["omnigs", "odgs", "op43dgs", "spags", "cubemap_3dgs", "sc_omnigs", "seam360gs"])
 def test_every_explicit_method_takes_the_options_of_padgs_plus(name):
     given = "train.poses=given" if name == "sc_omnigs" else "seed=0"
-    options = [f"method.{key}={value}" for key, value in {**TUNED, "initial_per_pixel": 0.01}.items()]
+    options = [f"method.{key}={value}" for key, value in {**TUNED, "initial_per_pixel": 0.1}.items()]
     method = make_method(name, *options, given)
-    records = list(method.fit(tiny_scene(), Budget(70)))
+    tiny = tiny_scene()
+    points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
+    records = method.fit(replace(tiny, points=points, point_colors=tiny.point_colors.repeat(10, 1)), Budget(70))
     model = method.model
-    assert method.start > 0.01 * 2000 and (model.splats.means.norm(dim=-1) > 10).any(), "points and sky"
+    far = model.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
+    assert method.start == 0.1 * 2000 + far.sum() and far.any(), "points and sky"
+    assert torch.allclose(torch.sigmoid(model.splats.opacity_logits), torch.tensor(0.5))
+    records = list(records)
     assert any("least important" in event for record in records for event in record.events)
     assert model.splats.sh_rest.shape[1] == 8
     rates = {group.name: group.learning_rate(0) for group in model.groups()}
