@@ -32,7 +32,7 @@ _TABLES = {  # of padgs.reports.specs -> experiments
     "equal_time": ("equal_time",),
     "ladder": ("ladder",),
     "deviations": ("deviations",),
-    "order": (*QUALITY_ORDER, "pixel_constants"),
+    "order": (*QUALITY_ORDER, "pixel_constants", "all_methods"),
     "length": ("length",),
     "learning_rates": ("learning_rates",),
     "modulation": ("modulation",),

@@ -19,13 +19,13 @@ six=bedroom,room,flat,basement,plaza,court
 # Table, scenes, runs of a scene, seconds of a run on one core (of the runs in reports/measured), settings of padgs-run
 plan() {
   cat <<END
-A $six 27 240 +experiment=order train.iterations=3000 data.width=256 seed=0,1,2 method=$described
-A $six 5 570 +experiment=order train.iterations=3000 data.width=256 seed=0 method=$released,egonerf_small
+A $six 27 240 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 method=$described
+A $six 5 570 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0 method=$released,egonerf_small
 C $six 27 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described
 C bedroom,basement,plaza 15 330 +experiment=equal_time budget.seconds=300 budget.clock=cpu data.width=512 seed=0,1,2 method=omnigs,spags,spags_tuned,padgs,padgs_plus
 D bedroom,basement,court 12 350 +experiment=ablation train.iterations=3000 data.width=256 seed=0,1,2
 D bedroom,basement,court 21 350 +experiment=ladder train.iterations=3000 data.width=256 seed=0,1,2
-D bedroom,basement,court 12 270 +experiment=modulation train.iterations=3000 data.width=256 seed=0,1,2
+D bedroom,basement,court 12 270 +experiment=modulation protocol=both train.iterations=3000 data.width=256 seed=0,1,2
 E bedroom,court 18 220 +sweep=tau train.iterations=1500 data.width=256 seed=0,1,2 method.tau=0,0.3,0.5,0.7,0.9,1
 E bedroom,court 12 220 +sweep=lambda train.iterations=1500 data.width=256 seed=0,1,2 train.lambda_l1=0.2,0.6,0.8,1
 E bedroom,court 12 220 +sweep=voxel_size train.iterations=1500 data.width=256 seed=0,1,2 method.voxel_pixels=0.1,1,3,10
