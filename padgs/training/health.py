@@ -251,7 +251,8 @@ class Guard:
         """
         self._gradients = gradients
         self._rows = [parameter for group in groups if group.is_of_rows for parameter in group.parameters]
-        self._scales = [p for group in groups if scales and group.name == SCALES for p in group.parameters]
+        log_units = {group.parameters[0]: math.log(group.unit) for group in groups if group.name == SCALES}
+        self._scales = log_units if scales else {}  # log-scales, and the logarithm of the world units that they are in
         device = groups[0].parameters[0].device
         # Since the last report: the sum of bad rows over renders, and the most in one render minus those allowed.
         self._bad = torch.zeros((), dtype=torch.int64, device=device)
@@ -259,7 +260,7 @@ class Guard:
         self._bounds = [0.0, 0.0]
         if self._scales:
             farthest = (scene.points.double() - scene.train[0].center).norm(dim=-1).max().item()
-            initial = max(parameter[..., -3:].max().item() for parameter in self._scales)
+            initial = max(scales[..., -3:].max().item() + unit for scales, unit in log_units.items())
             largest = max(math.log(max(farthest, scene.scale)), initial)
             self._bounds = [math.log(MIN_SCALE * scene.scale), largest]
 
@@ -281,9 +282,9 @@ class Guard:
     @torch.no_grad()
     def bound(self) -> None:
         """Clamp scales to their bounds after a step."""
-        for parameter in self._scales:
+        for parameter, log_unit in self._scales.items():
             axes = parameter[..., -3:]
-            axes.clamp_(*self._bounds)
+            axes.clamp_(*(bound - log_unit for bound in self._bounds))
             axes.copy_(torch.maximum(axes, axes.amax(-1, keepdim=True) - math.log(MAX_ANISOTROPY)))
 
     def report(self, iteration: int) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ class ParameterGroup:
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
     paced: bool = True  # whether it follows `Pace`; learned cameras do not
     is_of_rows: bool = False  # whether each row belongs to one Gaussian or anchor
+    unit: float = 1.0  # world units of log-scales
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -90,10 +90,11 @@ class PaDGS(nn.Module):
         positions: [A, 3] world.
         features: [A, C].
         offsets: [A, K, 3] in units of the anchor's scale.
-        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians; world units.
+        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians; in `unit`.
         decoder: three networks.
         voxel_size: spacing of the grid that anchors live on, world units.
         distance_scale: divisor of the distance input, world units.
+        unit: world units of the log-scales; a power of two, so that worlds that differ by one train alike, bit by bit.
     """
 
     positions: Tensor
@@ -106,12 +107,13 @@ class PaDGS(nn.Module):
         *,
         voxel_size: float,
         distance_scale: float = 1.0,
+        unit: float = 1.0,
         generator: torch.Generator | None = None,
     ) -> None:
         """Build an untrained model: Gaussians at their anchors [A, 3], log-scales [A, 6], random networks."""
         super().__init__()
         count = len(positions)
-        self.options, self.voxel_size, self.distance_scale = options, voxel_size, distance_scale
+        self.options, self.voxel_size, self.distance_scale, self.unit = options, voxel_size, distance_scale, unit
         self.register_buffer("positions", positions)
         self.features = nn.Parameter(positions.new_zeros(count, options.features))
         self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
@@ -125,12 +127,15 @@ class PaDGS(nn.Module):
         automatic = automatic_voxel_size(scene, options.voxel_pixels)
         voxel_size = automatic if options.voxel_size == "auto" else float(options.voxel_size)
         positions = anchors_from_points(scene.points, voxel_size)
+        in_world = options.distance_unit == "world"
+        unit = 1.0 if in_world else 2.0 ** round(math.log2(scene.scale))
         return cls(
             positions,
-            initial_log_scales(positions, voxel_size),
+            initial_log_scales(positions / unit, voxel_size / unit),
             options,
             voxel_size=voxel_size,
-            distance_scale=scene.scale if options.distance_unit == "scene" else 1.0,
+            distance_scale=1.0 if in_world else scene.scale,
+            unit=unit,
             generator=torch.Generator().manual_seed(seed),
         )
 
@@ -149,7 +154,7 @@ class PaDGS(nn.Module):
     @torch.no_grad()
     def centers(self) -> Tensor:
         """Return the means [A K, 3] of all Gaussians, selected or not, world frame, without gradient (Eq. 14)."""
-        reach = torch.exp(self.log_scales[:, None, :3])
+        reach = self.unit * torch.exp(self.log_scales[:, None, :3])
         return (self.positions[:, None] + reach * self.offsets).view(-1, 3)
 
     @torch.no_grad()
@@ -176,12 +181,16 @@ class PaDGS(nn.Module):
         """
         weights, anchors, precision = self.decoder.weights(), self.seen_anchors(view), self.options.precision
         if capacity is None or not supports_capacity(anchors, precision):
-            return Decoded(*decode_gaussians(weights, anchors, precision))
-        gaussians, slots, raw_opacities, count = decode_with_capacity(weights, anchors, capacity, precision)
-        return Decoded(gaussians, slots, raw_opacities, HostCopy(count))
+            gaussians, slots, raw_opacities = decode_gaussians(weights, anchors, precision)
+            count = None
+        else:
+            gaussians, slots, raw_opacities, count = decode_with_capacity(weights, anchors, capacity, precision)
+        if self.unit != 1:
+            gaussians = replace(gaussians, means=self.unit * gaussians.means, scales=self.unit * gaussians.scales)
+        return Decoded(gaussians, slots, raw_opacities, None if count is None else HostCopy(count))
 
     def seen_anchors(self, view: View) -> SeenAnchors:
-        """Return the inputs of the decoder for a view."""
+        """Return the inputs of the decoder for a view, lengths in `unit`."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
         seen = [direction]
@@ -192,7 +201,7 @@ class PaDGS(nn.Module):
             seen.append(seen_omega[:, None])
         attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
         seen = torch.cat(seen, dim=-1)
-        return SeenAnchors(self.features, seen, self.positions, self.offsets, self.log_scales, attenuation)
+        return SeenAnchors(self.features, seen, self.positions / self.unit, self.offsets, self.log_scales, attenuation)
 
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:

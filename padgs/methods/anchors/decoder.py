@@ -56,7 +56,7 @@ class SeenAnchors(NamedTuple):
 
     features: Tensor  # [A, C]
     seen: Tensor  # [A, I - C] direction from the camera; distance and distortion if they are inputs
-    positions: Tensor  # [A, 3] world
+    positions: Tensor  # [A, 3] world axes
     offsets: Tensor  # [A, K, 3] in units of the anchor's scale
     log_scales: Tensor  # [A, 6]; the first three scale the offsets, the last three the Gaussians
     attenuation: Tensor  # [A] factor on opacities (Eq. 15)

@@ -155,7 +155,7 @@ class Growth:
         events = (limited,) if len(new_anchors) < found else ()
         if len(new_anchors) == 0:
             return events
-        log_sizes = torch.log(new_anchors.sizes * model.voxel_size).to(model.log_scales)
+        log_sizes = torch.log(new_anchors.sizes * (model.voxel_size / model.unit)).to(model.log_scales)
         new = {
             "offsets": model.offsets.new_zeros(len(new_anchors), *model.offsets.shape[1:]),
             "features": new_anchors.features,
@@ -181,7 +181,7 @@ class Growth:
         if faint.any():
             self.keep(~faint, optimizer)
         if options.log_scale_cap is not None:
-            model.log_scales.data[:, 3:].clamp_(max=options.log_scale_cap)
+            model.log_scales.data[:, 3:].clamp_(max=options.log_scale_cap - math.log(model.unit))
         count = int(faint.sum())
         return (f"pruned {count} anchors",) if count else ()
 

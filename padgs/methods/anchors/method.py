@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
 from padgs.methods.anchors.growth import GrowthOptions
-from padgs.methods.anchors.model import AnchorModel, LearningRates
+from padgs.methods.anchors.model import LENGTHS, AnchorModel, LearningRates
 from padgs.scene import Scene
 from padgs.training.corrections import FISHEYES
 from padgs.training.loop import Record, Stage
@@ -87,7 +87,7 @@ class PaDGSMethod(Method):
         """See `Method.restore`."""
         stored = state.of_model()
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
-        lengths = {name: stored.values[name] for name in ("voxel_size", "distance_scale")}
+        lengths = {name: stored.values[name] for name in LENGTHS}
         return self._model_of(PaDGS(positions, log_scales, self.options, **lengths), math.nan, PUBLISHED_ITERATIONS)
 
     def _model_of(self, anchors: PaDGS, extent: float, iterations: int) -> AnchorModel:

@@ -20,6 +20,7 @@ from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
 
 OFFSET_RATE_UNITS = ("scene", "world")
+LENGTHS = ("voxel_size", "distance_scale", "unit")  # attributes of the anchors in a state
 HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
 
 
@@ -48,7 +49,7 @@ class LearningRates(ExtentOptions):
         """Return parameter groups for a run of `iterations`; `extent` in `offset_rate_unit`."""
         first, last = self.offset_rate
         groups = [
-            ParameterGroup(name, (getattr(model, name),), rate, is_of_rows=True)
+            ParameterGroup(name, (getattr(model, name),), rate, is_of_rows=True, unit=model.unit)
             for name, rate in (
                 ("offsets", LogLinear(extent * first, extent * last, iterations)),
                 ("features", Constant(self.feature_rate)),
@@ -172,7 +173,7 @@ class AnchorModel:
     def state(self) -> State:
         """Return parameters, growth statistics and random state; not copies."""
         growth = {f"growth/{name}": values for name, values in self.growth.statistics.items()}
-        values = {"voxel_size": self.anchors.voxel_size, "distance_scale": self.anchors.distance_scale}
+        values = {name: getattr(self.anchors, name) for name in LENGTHS}
         return State(
             {**self.anchors.state_dict(), **growth, "random/growth": self.growth.generator.get_state()}, values
         )
@@ -187,6 +188,6 @@ class AnchorModel:
     def load_model(self, state: State) -> None:
         """Load anchors and networks only; growth starts anew."""
         self.anchors.load(state.tensors)
-        self.anchors.voxel_size = state.values["voxel_size"]
-        self.anchors.distance_scale = state.values["distance_scale"]
+        for name in LENGTHS:
+            setattr(self.anchors, name, state.values[name])
         self.growth.reset_statistics()
