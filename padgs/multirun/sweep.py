@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import signal
 import threading
 import time
 from collections import Counter
@@ -175,8 +176,10 @@ class Multirun:
                 return None
             display = Display(self._console, redraw=0.0, line=SECONDS_BETWEEN_LINES)
             with Interrupt() as stop, display, repeated(lambda: self._tick(stop, display)):
-                launch(launcher, jobs, first_number)
-                self._tick(stop, display)
+                try:
+                    launch(launcher, jobs, first_number)
+                finally:  # a closed terminal ends workers that are still being imported, too
+                    self._tick(stop, display)
         except Exception as error:
             return error  # of the launcher or a worker process: jobs themselves raise nothing
         return None
@@ -227,6 +230,12 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int) -> None:
     The launchers of submitit raise the error of the first dead job and leave the others unobserved, so their jobs are
     submitted here in the same way.
     """
+    if "joblib" in type(launcher).__module__:
+        from joblib.externals.loky.backend.resource_tracker import ensure_running
+
+        handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        ensure_running()  # its helper process would end with the terminal, and report that as errors
+        signal.signal(signal.SIGHUP, handler)
     if "submitit" not in type(launcher).__module__:
         launcher.launch(jobs, initial_job_idx=first_number)
         return

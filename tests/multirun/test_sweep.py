@@ -210,6 +210,20 @@ def test_ctrl_c_lets_running_jobs_stop_by_themselves(tmp_path, monkeypatch):
     assert again.counts() == {"ok": 3} and again.launched == ["++seed=1", "++seed=2"]
 
 
+class TerminalCloses(Start):
+    def launch(self, jobs, initial_job_idx):
+        self.launched += [job[0] for job in jobs]
+        os.kill(os.getpid(), signal.SIGHUP)
+        raise RuntimeError("a worker process was terminated")
+
+
+def test_a_terminal_that_closes_while_workers_are_imported_launches_nothing_again(tmp_path):
+    start = TerminalCloses(tmp_path, 1, ELSEWHERE)
+    with pytest.raises(Interrupted):
+        start.counts()
+    assert len(start.launched) == 3
+
+
 class InterruptsTwice(Start):
     def end(self, number, job):
         self.board.write(number, JobState("running", f"room_{job[-1]}"))
