@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from PIL import Image
 from torch import Tensor
 
@@ -30,6 +31,7 @@ from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.sfm import image_pairs
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
 from padgs.data.prepare.work import (
+    LOCK,
     Prepared,
     PrepareOptions,
     WorkFolder,
@@ -70,18 +72,22 @@ def prepare(
             hidden folder; nothing is written to the destination.
     """
     options = options or PrepareOptions()
-    if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        if result := find_result(source, destination, options):
-            return result
-        raise DataError(
-            f"{destination} exists, and was not made of {source} with these options; nothing is overwritten: remove it "
-            "or choose another path"
-        )
+    if result := _existing(source, destination, options):
+        return result
     if destination.name in (*IMAGE_FOLDERS, *MASK_FOLDERS) and destination.resolve().parent == source.resolve():
         raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
     work = destination.absolute().with_name(f".{destination.name}.prepare")
+    lock = FileLock(work / LOCK)
     try:
-        return _Job(source, destination.absolute(), work, options, progress).run()
+        work.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+        # Another process may have finished in the meantime.
+        return (
+            _existing(source, destination, options)
+            or _Job(source, destination.absolute(), work, options, progress).run()
+        )
+    except Timeout as error:
+        raise DataError(f"another process prepares {destination}; wait for it, or choose another path") from error
     except OSError as error:
         raise DataError(
             f"cannot prepare {destination} ({error.strerror or error}); the same command resumes"
@@ -97,8 +103,25 @@ def prepare(
             f"which resumes; else remove {work} to start over"
         ) from error
     finally:
-        if work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
+        if lock.is_locked and work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
             shutil.rmtree(work, ignore_errors=True)  # nothing to resume
+        lock.release()
+
+
+def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
+    """Return the result of an earlier call; None if the destination is free.
+
+    Raises:
+        DataError: something else is there.
+    """
+    if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
+        return None
+    if result := find_result(source, destination, options):
+        return result
+    raise DataError(
+        f"{destination} exists, and was not made of {source} with these options; nothing is overwritten: remove it "
+        "or choose another path"
+    )
 
 
 class _Job:

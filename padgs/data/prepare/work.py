@@ -23,6 +23,7 @@ from padgs.data.masks import mask_path
 from padgs.data.prepare.sfm import PAIRS
 from padgs.data.prepare.sources import find_source, is_video
 
+LOCK = ".lock"  # of the process that works in the folder
 MAX_THREADS = 8
 MEMORY_PER_THREAD = 600_000_000  # bytes, for panoramas of 2048 x 1024, and for matching any size
 MAX_PIXELS = 3200 * 1600  # pycolmap reduces larger panoramas to this
@@ -164,7 +165,7 @@ class WorkFolder:
         marker = self.path / f"{kind}.sha256"
         if not (marker.is_file() and marker.read_text() == digest):
             for path in self.path.iterdir() if self.path.is_dir() else ():
-                if path.name not in keep:
+                if path.name not in (*keep, LOCK):
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
         self.path.mkdir(parents=True, exist_ok=True)
         marker.write_text(digest)

@@ -200,6 +200,20 @@ def test_a_result_inside_its_source_is_not_read_as_input(scene, tmp_path):
     assert prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1)) == replace(result, seconds={})
 
 
+def test_one_destination_is_prepared_by_one_process_at_a_time(tmp_path):
+    source, out = noise(tmp_path / "in"), tmp_path / "out"
+
+    def start_another(step, done, total):
+        with pytest.raises(DataError, match="another process prepares .*out; wait for it, or choose another path"):
+            prepare(source, out)
+        assert (tmp_path / ".out.prepare" / "images").is_dir()
+        raise KeyboardInterrupt
+
+    for _ in range(2):  # the lock is free after an interruption
+        with pytest.raises(KeyboardInterrupt):
+            prepare(source, out, PrepareOptions(threads=1), start_another)
+
+
 def test_errors_of_pycolmap_are_reported_with_a_remedy(tmp_path, monkeypatch):
     def run(tell=lambda step, done, total: None):
         prepare(source, tmp_path / "out", PrepareOptions(threads=1), tell)
