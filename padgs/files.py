@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import socket
+import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -26,6 +27,16 @@ _OTHER_FORMATS = {
     b"\0\0\0\x0cJXL": "JPEG XL",
     b"<": "HTML, XML or SVG",
 }
+DAMAGE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    LookupError,
+    EOFError,
+    ArithmeticError,
+    struct.error,
+)  # of Pillow
 MAX_PIXELS = 180_000_000  # a panorama of 18972x9486
 
 DRAFT = ".padgs-draft-"  # begins the names of files and folders that are not complete
@@ -127,7 +138,7 @@ def open_image(file: Path | IO[bytes], name: object = None) -> Image:
     Image.MAX_IMAGE_PIXELS = None  # the size is checked below, with a remedy
     try:
         image = Image.open(file, formats=IMAGE_FORMATS)
-    except (OSError, SyntaxError, ValueError, TypeError, OverflowError) as error:
+    except DAMAGE as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         found = _format_of(file)

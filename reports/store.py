@@ -17,7 +17,7 @@ from typing import Any
 from PIL import Image
 
 from padgs import results
-from padgs.files import open_image, write_atomically
+from padgs.files import DAMAGE, ImageError, open_image, write_atomically
 from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
@@ -93,7 +93,10 @@ def split_image(path: Path, count: int) -> list[Image.Image]:
         OSError: the file is missing or truncated.
     """
     with open_image(path) as image:
-        image.load()
+        try:
+            image.load()
+        except DAMAGE as error:
+            raise ImageError(f"{path} is damaged ({error}); score the run again") from error
         width = image.width // count
         return [image.crop((part * width, 0, (part + 1) * width, image.height)) for part in range(count)]
 

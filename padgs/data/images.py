@@ -28,7 +28,7 @@ from padgs.data.image_metadata import (
     srgb_conversion,
     tilt_of,
 )
-from padgs.files import ImageError, open_image
+from padgs.files import DAMAGE, ImageError, open_image
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 _COLOUR = ("RGB", "RGBA", "RGBa", "RGBX", "P", "PA", "YCbCr")
@@ -69,7 +69,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
             crop, tilt = crop_of(image, path), tilt_of(image)
             if not mask:
                 conversion = srgb_conversion(image, data, path)
-        except (OSError, SyntaxError, ValueError, EOFError) as error:
+        except DAMAGE as error:
             if isinstance(error, DataError):
                 raise
             raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
@@ -160,7 +160,7 @@ def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
             crop, stored = crop_of(image, path), _eight_bit(image).convert(mode)
             cut = _misses_pixels(image, data, np.asarray(stored))
             pixels = np.array(stored if convert is None else convert(stored))
-    except (OSError, SyntaxError, ValueError) as error:
+    except DAMAGE as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error

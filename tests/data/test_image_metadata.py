@@ -13,6 +13,7 @@ from support.fixtures import World, write_colmap_text
 from padgs.data import DataError, load
 from padgs.data.images import decode, inspect
 from padgs.data.prepare.sources import find_source
+from padgs.reports.store import split_image
 
 XMP = b"XML:com.adobe.xmp\0\0\0\0\0"  # begins the chunk iTXt of a PNG
 PIXELS = np.random.default_rng(3).integers(0, 256, (64, 128, 3), dtype=np.uint8)
@@ -205,6 +206,8 @@ def test_other_kinds_of_pixels_are_refused_by_their_name(image, as_panorama, as_
 def test_long_texts_in_a_file_name_the_file(before, tmp_path):
     text = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(3 << 20)))
     path = with_chunk(tmp_path / "a.png", PANORAMA, text, before)
+    with pytest.raises(OSError, match=r"a.png .*[Dd]ecompressed data too large"):
+        split_image(path, 3)
     for look in (inspect, decode) if before == b"IDAT" else (decode,):
         with pytest.raises(DataError, match=r"a.png .*[Dd]ecompressed data too large"):
             look(path)
