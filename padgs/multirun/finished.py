@@ -42,14 +42,16 @@ class FinishedJobs:
                     entry = json.loads(line)
                     self._known[entry["job"]] = entry
 
-    def status(self, overrides: Sequence[str]) -> str | None:
-        """Return the status of a job's result; None if the job must be looked up."""
+    def find(self, overrides: Sequence[str]) -> tuple[str, str] | None:
+        """Return status and run of a job with a result; None if the job must be looked up."""
         if any(OTHER_FILES.match(text) for text in overrides):
             return None
         entry = self._known.get(_key(overrides))
         if entry is None or entry["written"] is None or entry["written"] != self._written(entry["run"]):
             return None
-        return entry["status"] if entry["signature"] == (entry["data"] and signature(entry["data"])) else None
+        if entry["signature"] != (entry["data"] and signature(entry["data"])):
+            return None
+        return entry["status"], entry["run"]
 
     def add(self, overrides: Sequence[str], run: str, status: str, data: str | None) -> None:
         """Add a job that has ended with a result; a full disk loses only this entry."""

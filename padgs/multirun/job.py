@@ -53,7 +53,7 @@ def job_of_many(composed: DictConfig) -> str:
             config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
             with served_scene(config) as scene:
-                result = run(config, console, entry, scene)
+                result = run(config, console, entry, scene, brief=not alone)
             search_smallest(config, scene, result, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:

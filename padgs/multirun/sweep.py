@@ -7,6 +7,7 @@ line sums up all jobs while they run, and Ctrl-C lets running jobs write their c
 from __future__ import annotations
 
 import hashlib
+import shlex
 import shutil
 import signal
 import threading
@@ -25,17 +26,19 @@ from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.table import Table
 
 from padgs import results
-from padgs.checks import typed
+from padgs.checks import printable, typed
 from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, WAITING, Board, JobState, status_line
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
 from padgs.results import Result, ResultError
 from padgs.runs.config import RunOptions
-from padgs.runs.console import Display, say
+from padgs.runs.console import Display, compact, duration, psnr_of, say
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import RETRIED
 from padgs.runs.store import RunStore, cannot_write, labels
@@ -44,6 +47,7 @@ from padgs.runs.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 ATTEMPTS = 2  # of a job that began and whose process died: another job may have caused it
 IDLE_LAUNCHES = 5  # in a row in which no job began
 SECONDS_BETWEEN_TICKS = 1.0
+MOST_ROWS = 40  # of the table at the end
 SECONDS_BETWEEN_LINES = 30.0  # without a terminal
 
 
@@ -89,11 +93,14 @@ class Multirun:
         self.board = Board(Path(config.hydra.sweep.dir))
         self._in_process = not in_own_process(config.hydra)
         self._console, self._finished = console, FinishedJobs(self.runs)
-        statuses = [self._finished.status(job) for job in jobs]
+        found = [self._finished.find(job) for job in jobs]
         if config.retry == "failed":
-            statuses = [None if status in RETRIED else status for status in statuses]
-        self.before = Counter(status for status in statuses if status is not None)
-        self.jobs = [list(job) for job, status in zip(jobs, statuses, strict=True) if status is None]
+            found = [None if known and known[0] in RETRIED else known for known in found]
+        self.before = Counter(known[0] for known in found if known)
+        self.jobs = [list(job) for job, known in zip(jobs, found, strict=True) if known is None]
+        names = titles(jobs)
+        self._titles = [title for title, known in zip(names, found, strict=True) if known is None]
+        self._rows = [(title, known[1]) for title, known in zip(names, found, strict=True) if known]
         self.states = {index: JobState() for index in range(len(self.jobs))}
         self._numbers = dict.fromkeys(self.states, -1)  # of jobs on the board; a new one at each attempt
         self._reasons: set[str] = set()  # printed errors
@@ -135,8 +142,6 @@ class Multirun:
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
             self._track()
-            if self._in_process and waiting and any(self.states[index].status != REFUSED for index in batch):
-                self._say(self.line())
 
     def counts(self) -> Counter[str]:
         """Return status -> number of jobs, those finished before included."""
@@ -150,9 +155,10 @@ class Multirun:
     def close(self) -> Counter[str]:
         """Print how the jobs ended; delete the board unless it explains a crash or jobs still need it."""
         for index, state in self.states.items():
-            if state.status == ELSEWHERE and (result := self._result(state)):  # the other process has finished it
+            if state.status == ELSEWHERE and (result := self._result(state.run)):  # the other process has finished it
                 self._end(index, replace(state, status=result.status))
         self._say(self.line())
+        self._show_table()
         self._track()
         counts = self.counts()
         ended = [state.status for state in self.states.values() if state.status in results.STATUSES]
@@ -215,13 +221,51 @@ class Multirun:
             complain(state.reason)
         if state.status in results.STATUSES and state.run:
             self._finished.add(self.jobs[index], state.run, state.status, state.data)
+            self._rows.append((self._titles[index], state.run))
+            line = f"{self._titles[index] or state.run}: {', '.join(summary(state.status, self._result(state.run)))}"
+            more = status_line(self.before, [*self.states.values()], time.monotonic() - self._began)
+            self._say(f"{line}; {more}" if self._in_process else line)
 
-    def _result(self, state: JobState) -> Result | None:
+    def _result(self, run: str) -> Result | None:
         with suppress(ResultError):
-            return RunStore(self.runs / state.run).result() if state.run else None
+            return RunStore(self.runs / run).result() if run else None
+
+    def _show_table(self) -> None:
+        """Print a row for each run unless they are many, and the command that shows more."""
+        found = [(title, result) for title, run in self._rows if (result := self._result(run))]
+        if 1 < len(found) <= MOST_ROWS:
+            table = Table("run", "result", box=SIMPLE_HEAD)
+            for title, result in found:
+                table.add_row(*map(printable, (title or result.run, ", ".join(summary(result.status, result)))))
+            self._console.print(table)
+        if found:
+            what = "all" if any(result.experiments for _, result in found) else "runs"
+            self._say(f"next: {shlex.join(['padgs', 'report', what, str(self.runs)])}")
 
     def _say(self, text: str) -> None:
         say(self._console, text)
+
+
+def titles(jobs: Sequence[Sequence[str]]) -> list[str]:
+    """Return the settings of each job that are not the same in all jobs.
+
+    >>> titles([["method=padgs", "++method.tau=0.3", "++seed=1"], ["method=padgs", "++method.tau=0.9", "++seed=1"]])
+    ['tau = 0.3', 'tau = 0.9']
+    """
+    settings = [dict(text.lstrip("+~").partition("=")[::2] for text in job) for job in jobs]
+    keys = dict.fromkeys(key for job in settings for key in job)
+    varying = [key for key in keys if len({job.get(key) for job in settings}) > 1]
+    return [", ".join(f"{key.rpartition('.')[2]} = {job[key]}" for key in varying if key in job) for job in settings]
+
+
+def summary(status: str, result: Result | None) -> list[str]:
+    """Return quality, size and time of a run, or why it has none."""
+    if result is None or not result.ok:
+        reason = result.reason if result else ""
+        return [f"{status} ({reason})" if reason else status]
+    psnr, size = psnr_of(result), [*result.counts.items()][:1]
+    parts = ["ok" if psnr is None else f"{psnr:.2f} dB", *(f"{compact(count)} {name}" for name, count in size)]
+    return [*parts, f"trained {duration(result.timing.get('train_seconds', 0))}"]
 
 
 def launch(launcher: Any, jobs: list[list[str]], first_number: int) -> None:

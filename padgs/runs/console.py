@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -31,6 +33,8 @@ def say(console: Console, text: object, style: str = "") -> None:
 REDRAWS_PER_SECOND = 5
 SECONDS_BETWEEN_LINES = 10.0  # without a terminal
 RECENT = 64  # records that the speed is measured over
+COLUMNS, BAR = 80, 8  # characters of the progress line, and of the bar in it
+MISSING = "–"
 
 D = TypeVar("D", bound="Display")
 
@@ -38,10 +42,14 @@ D = TypeVar("D", bound="Display")
 class Display:
     """A part of the console that is redrawn; its last content stays."""
 
-    def __init__(self, console: Console, *, redraw: float, line: float) -> None:
-        """Redraw every `redraw` seconds in a terminal; print every `line` seconds elsewhere."""
+    def __init__(self, console: Console, *, redraw: float, line: float, transient: bool = False) -> None:
+        """Redraw every `redraw` seconds in a terminal; print every `line` seconds elsewhere.
+
+        The last content is removed from a terminal if it is transient.
+        """
         self._console = console
-        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        live = Live(console=console, auto_refresh=False, transient=transient) if console.is_terminal else None
+        self._live = live
         self._interval = line if self._live is None else redraw
         self._shown = 0.0
 
@@ -52,8 +60,9 @@ class Display:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
+        with suppress(OSError):
+            if self._live is not None:
+                self._live.stop()
 
     @property
     def is_due(self) -> bool:
@@ -63,17 +72,18 @@ class Display:
     def show(self, line: str, picture: RenderableType | None = None) -> None:
         """Show a line, or a picture if there is one and the console is a terminal."""
         self._shown = time.monotonic()
-        if self._live is not None:
-            self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
-        else:
-            self._console.print(line, highlight=False, soft_wrap=True)
+        with suppress(OSError):  # a closed terminal ends no run
+            if self._live is not None:
+                self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
+            else:
+                self._console.print(line, highlight=False, soft_wrap=True)
 
 
 class LiveLine(Display):
-    """Progress of one run: iteration, share of the run, loss, held-out PSNR, counts, speed and remaining time."""
+    """Progress of one run: remaining time, a bar, iteration, loss, held-out PSNR, count and speed."""
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES)
+    def __init__(self, console: Console, transient: bool = False) -> None:
+        super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES, transient=transient)
         self._times: deque[tuple[int, float, float]] = deque(maxlen=RECENT)
         self._psnr: float | None = None
 
@@ -85,18 +95,20 @@ class LiveLine(Display):
             self.show(self._line(record))
 
     def _line(self, record: Record) -> str:
-        parts = [f"{record.iteration} ({record.progress:.0%})", f"loss {float(record.loss):.4f}"]
-        if self._psnr is not None:
-            parts.append(f"PSNR {self._psnr:.2f}")
-        parts += [f"{name} {compact(count)}" for name, count in record.counts.items()]
         (first, behind, start), (latest, share, end) = self._times[0], self._times[-1]
+        left = duration((1 - share) / (share - behind) * (end - start)) if share > behind else MISSING
+        filled = round(BAR * share)
+        parts = [f"ETA {left}", f"{'█' * filled}{'░' * (BAR - filled)} {share:4.0%}", f"{record.iteration}"]
+        parts.append(f"loss {float(record.loss):.4f}")
+        if self._psnr is not None:
+            parts.append(f"{self._psnr:.2f} dB")
+        parts += [f"{compact(count)} {name}" for name, count in [*record.counts.items()][:1]]
         if share > behind:
-            parts += [f"{(latest - first) / max(end - start, 1e-9):.1f} it/s"]
-            parts += [f"ETA {duration((1 - share) / (share - behind) * (end - start))}"]
-        return "  ".join(parts)
+            parts.append(f"{compact(round((latest - first) / max(end - start, 1e-9), 1))} it/s")
+        return "  ".join(parts)[:COLUMNS]
 
 
-def compact(count: int) -> str:
+def compact(count: float) -> str:
     """Return a count in at most five characters.
 
     >>> [compact(n) for n in (987, 12_345, 123_456, 2_345_678)]
@@ -118,7 +130,8 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-MISSING = "–"
+# Least PSNR of a verdict in words
+SHARPNESS = ((28, "sharp"), (24, "slightly soft"), (20, "blurred"), (-float("inf"), "hardly recognisable"))
 MEANINGS = {  # word in the name of a metric -> meaning, with an arrow towards better values
     "psnr": "↑ dB",
     "ssim": "↑ structural similarity",
@@ -146,6 +159,7 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     if result.ended:
         say(console, f"stopped early, after {result.iterations_done} iterations: {printable(result.ended)}", "yellow")
     if result.scores:
+        say(console, headline(result), "bold" if result.ok else "")
         console.print(marks(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
         say(console, note, "yellow")
@@ -160,6 +174,30 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
         costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
     say(console, ", ".join(costs))
     say(console, folder, "bold")
+    if result.ok:
+        say(console, f"next: {shlex.join(['padgs', 'view', str(folder)])}", "dim")
+
+
+def psnr_of(result: Result) -> float | None:
+    """Return the PSNR of a result, under the first protocol that has one."""
+    values = (scores.metrics.get(name) for name in ("psnr", "ws_psnr") for scores in result.scores.values())
+    return next((value for value in values if value is not None), None)
+
+
+def headline(result: Result) -> str:
+    """Return the quality of a run in a sentence.
+
+    >>> from padgs.results import Scores
+    >>> from types import SimpleNamespace as Some
+    >>> headline(Some(scores={"paper": Scores({}, {"psnr": 29.93}, {"a": {}, "b": {}})}, dataset="", ok=True))
+    '29.9 dB on 2 held-out photographs: sharp'
+    """
+    psnr, count = psnr_of(result), max((len(scores.views) for scores in result.scores.values()), default=0)
+    views = f"held-out {'view' if result.dataset == 'synthetic' else 'photograph'}{'' if count == 1 else 's'}"
+    if psnr is None:
+        return f"scored on {count} {views}"
+    word = next(word for least, word in SHARPNESS if psnr >= least)
+    return f"{psnr:.1f} dB on {count} {views}" + (f": {word}" if result.ok else "")
 
 
 def marks(result: Result) -> Table:

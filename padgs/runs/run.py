@@ -62,6 +62,7 @@ def run(
     console: Console,
     callback: Callback = Callback(),  # noqa: B008 - no state
     scene: Scene | None = None,
+    brief: bool = False,
 ) -> Result:
     """Do what is missing of a run, and show its result.
 
@@ -70,6 +71,7 @@ def run(
         console: receives progress and the result.
         callback: is told of the folder and of checkpoints.
         scene: as `load_scene(config, start(config))` returns it; loaded if None.
+        brief: show only progress.
 
     Raises:
         DataError: the input cannot be used.
@@ -80,23 +82,24 @@ def run(
     scene = load_scene(config, start(config)) if scene is None else scene
     store = RunStore.of(config, scene)
     callback.started(store.path)
-    introduce(config, scene, store.path, console)
+    words = Console(quiet=True) if brief else console
+    introduce(config, scene, store.path, words)
     result = store.result()
     if result is not None and not _is_incomplete(config, result):
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
-        say(console, f"finished before, nothing to do{advice}")
-        show_result(result, store.path, console)
+        say(words, f"finished before, nothing to do{advice}")
+        show_result(result, store.path, words)
         return result
     with store:
-        result = _completed(config, scene, store, console)
+        result = _completed(config, scene, store, words)
         if result is None:
-            method, progress = _prepared(config, scene, store, console)
+            method, progress = _prepared(config, scene, store, words)
             saved_at, saved = time.monotonic(), progress
             with _Outcome(initial_result(config, scene, store.path.name), scene) as outcome:
                 with (
                     Interrupt(callback.stop_requested) as interrupt,
                     Interrupt(store.stop.exists, STOP_SIGNALS) as stop,
-                    LiveLine(console) as line,
+                    LiveLine(console, transient=brief) as line,
                 ):
                     for record in method.fit(scene, config.time):
                         progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
@@ -120,7 +123,7 @@ def run(
                 if scene.test:
                     outcome.result = _scored(config, scene, store, outcome.result, method)
             result = store.finish(_final(config, outcome.result, progress))
-    show_result(result, store.path, console)
+    show_result(result, store.path, words)
     return result
 
 

@@ -13,6 +13,7 @@ smallest candidate that is not inferior to the control.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -254,7 +255,8 @@ def find_smallest(
     with run.files:
         result = Search(run, console, stop_requested).keep(epsilon)
     show(result.smallest, console)
-    say(console, run.folder.resolve().with_name(result.smallest["kept"]["run"]), "bold")
+    kept = run.folder.resolve().with_name(result.smallest["kept"]["run"])
+    say(console, kept if run.folder.is_absolute() else os.path.relpath(kept), "bold")
     return result
 
 

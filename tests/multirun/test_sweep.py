@@ -4,11 +4,14 @@ import io
 import os
 import signal
 import threading
+from dataclasses import replace
 
 import pytest
 from omegaconf import OmegaConf
 from rich.console import Console
+from support import made_up
 
+from padgs import results
 from padgs.multirun import sweep
 from padgs.multirun.board import Board, JobState
 from padgs.multirun.sweep import Multirun
@@ -68,6 +71,25 @@ def test_a_second_start_launches_nothing(tmp_path, target):
     assert again.counts() == {"ok": 3} and again.launched == []
     assert again.out.getvalue() == "3 of 3 done (3 before)\n"
     assert not again.folder.exists()
+
+
+class Scored(Start):
+    def finish(self, number, job, status):
+        super().finish(number, job, status)
+        one = replace(made_up.result(), run=f"room_{job[-1]}", counts={"gaussians": 1234}, experiments=())
+        results.write(one, self.runs / one.run)
+
+
+@pytest.mark.parametrize("target", [IN_PROCESS, ELSEWHERE])
+def test_each_run_has_a_line_that_says_what_differs_and_the_end_a_table_and_a_command(tmp_path, target):
+    start = Scored(tmp_path, 1, target)
+    start.counts()
+    *lines, end = start.out.getvalue().split("3 of 3 done\n")
+    assert [line for line in "".join(lines).splitlines() if line.startswith("seed = 1: ") and "1.23k gauss" in line]
+    assert end.count("seed = ") == 3 and f"next: padgs report runs {start.runs}" in end
+    again = Scored(tmp_path, 2, target)
+    again.counts()
+    assert again.out.getvalue().endswith(end), "finished before"
 
 
 def test_only_missing_jobs_are_launched(tmp_path):

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from support.tiny_run import SMALLEST, finish
 
 from padgs import results
+from padgs.checks import ConfigError
 from padgs.multirun.sweep import sweep
 
 TINY = [*SMALLEST, "train.iterations=40", "run.checkpoint_every=5", "tracking=none"]
@@ -26,12 +27,12 @@ def marks(folder: Path) -> dict[str, tuple]:
     return {result.run: (result.status, result.scores, result.counts, result.iterations_done) for result in ends}
 
 
-def test_an_unknown_key_of_tracking_is_reported_without_a_traceback(tmp_path, capsys):
+def test_an_unknown_key_of_tracking_is_refused(tmp_path):
     hydra = {"sweep": {"dir": str(tmp_path / "start")}, "launcher": {"_target_": "x.BasicLauncher"}}
     hydra |= {"runtime": {"choices": {}}, "sweeper": {"params": None}, "overrides": {"task": ["++seed=0"]}}
     config = {"run": {"folder": str(tmp_path)}, "retry": "none", "tracking": {"knid": "none"}, "hydra": hydra}
-    assert sweep(OmegaConf.create(config), Mock()) == {"refused": 1}
-    assert capsys.readouterr().err.startswith("error: unknown key tracking.knid; known: tracking.kind")
+    with pytest.raises(ConfigError, match="unknown key tracking.knid; known: tracking.kind.*did you mean"):
+        sweep(OmegaConf.create(config), Mock())
 
 
 @pytest.mark.slow
