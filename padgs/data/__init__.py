@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from padgs.data.assemble import assemble
+from padgs.data.assemble import assemble, found_images
 from padgs.data.capture import Capture, DataError, DataOptions
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
@@ -74,4 +74,4 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         raise DataError(f"{path}: synthetic scenes are made, not read from a folder; give another format, or auto")
     capture: Capture = lookup(LOADERS, format, "data.format")(path, options)
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
-    return replace(capture, mask=mask, notes=(*notes, *capture.notes))
+    return found_images(replace(capture, mask=mask, notes=(*notes, *capture.notes)))

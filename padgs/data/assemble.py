@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -12,7 +13,7 @@ from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
 from padgs.data.cloud import initial_cloud
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
 from padgs.data.masks import find_masks
-from padgs.data.splits import split_frames
+from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage
 from padgs.scene import Scene, View
 
@@ -130,6 +131,52 @@ def refuse_clashes(names: Sequence[str]) -> None:
                 f"the images {seen[key]!r} and {name!r} would share one name (without case and extension); rename one"
             )
         seen[key] = name
+
+
+def found_images(capture: Capture) -> Capture:
+    """Find images whose stated names differ from their files in leading folders, Unicode form or extension.
+
+    Raises:
+        DataError: a name points outside the image folder, and no end of it is there.
+    """
+    there = [is_inside(frame.name) and os.path.isfile(frame.image) for frame in capture.frames]
+    if all(there):
+        return capture
+    folder = next(folder for folder in (capture.image_folder, *capture.image_folder.parents) if folder.is_dir())
+    if folder == capture.folder:
+        folder = image_folder(folder, None)
+    meant: dict[str, set[str]] = {}
+    for file in image_names(folder):
+        whole, *without = spellings(file)
+        for key in (whole, *without[:1]):
+            meant.setdefault(key, set()).add(file)
+    found = {}  # stated name -> file
+    for frame, is_there in zip(capture.frames, there, strict=True):
+        files = next((meant[key] for key in spellings(frame.name) if key in meant), set())
+        if not is_there and len(files) == 1:
+            (found[frame.name],) = files
+    taken = Counter(found.values())
+    found = {name: file for name, file in found.items() if taken[file] == 1}
+    for frame in capture.frames:
+        if frame.name not in found and not is_inside(frame.name):
+            raise DataError(
+                f"the {capture.format} data set {capture.folder} names {frame.name!r}; names must be relative and stay "
+                f"inside the image folder (no '..'), or end like one image in {folder}: remove the leading folders"
+            )
+    if not found:
+        return capture
+    stated, file = next(iter(found.items()))
+    note = (
+        f"images: {len(found)} names differ from their files in folders, extension or Unicode form: {stated!r} is "
+        f"{os.path.relpath(folder / file, capture.folder)}"
+    )
+    names = {frame.name: found.get(frame.name, frame.name) for frame in capture.frames}
+    frames = (replace(frame, name=names[frame.name], image=folder / names[frame.name]) for frame in capture.frames)
+    split = capture.split and {
+        side: tuple(names.get(name, name) for name in listed_names) for side, listed_names in capture.split.items()
+    }
+    notes = (*capture.notes, note)
+    return replace(capture, image_folder=folder, frames=tuple(frames), split=split, notes=notes)
 
 
 def _refuse_missing(capture: Capture) -> None:

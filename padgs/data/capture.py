@@ -32,6 +32,16 @@ def listed(names: Iterable[object], most: int = 5) -> str:
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
+def refuse_special(path: Path) -> None:
+    """Refuse folders, pipes and devices in place of a file: reading a pipe waits, and some devices never end.
+
+    Raises:
+        DataError: the path exists, but is no file.
+    """
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path} cannot be read: it is no regular file; replace or remove it")
+
+
 _NUMBER = re.compile(r"(\d+)")
 
 
@@ -64,19 +74,6 @@ class Cloud:
 
     points: Tensor  # [P, 3] float64
     colors: Tensor | None  # [P, 3] uint8
-
-
-def color_bytes(values: Tensor, where: str) -> Tensor:
-    """Round colours [P, 3] to uint8, clamped to 0..255.
-
-    Raises:
-        DataError: a colour is not finite; `where` names the file.
-    """
-    if not (finite := values.isfinite().all(1)).all():
-        raise DataError(
-            f"the colour of point {(~finite).nonzero()[0].item()} of {where} is not finite; repair the cloud"
-        )
-    return values.round().clamp(0, 255).to(torch.uint8)
 
 
 @dataclass(frozen=True)

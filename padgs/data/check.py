@@ -28,6 +28,7 @@ SMALL = 256  # width at which colours are compared
 MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
 MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
 MIN_CORRELATION = 0.3  # of the colours of points and images that agree
+MAX_HIDDEN = 0.5  # share of an image that a sound mask hides at most: tripod, photographer, sky
 LEAK_DISTANCE = 0.01  # of the median depth: a test view nearer to a training view tests memory
 UNEVEN_EXPOSURE = 0.1  # standard deviation of the gains in doublings, from which learning exposures helps
 EXPOSURE_VIEWS = 40  # maximum number of views for measuring exposures
@@ -102,6 +103,11 @@ def check(
     report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
     report.median_depth = median_depth(poses, scene.points)
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
+    if hidden := [f"{name} ({share:.1%})" for name, share in report.masked.items() if share > MAX_HIDDEN]:
+        report.problems.append(
+            f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; in a "
+            "mask 255 means use, 0 means ignore: invert them, or set data.mask=none to do without"
+        )
     _check_leaks(scene, capture, report)
     if report.path_length == 0 and len(poses) > 1:
         report.problems.append("all cameras have the same centre; depth cannot be learned")
@@ -198,7 +204,7 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         return
     if report.suggestion is None:
         _check_exposures(scene, report)
-    if not report.coloured:
+    if not report.coloured or scene.point_colors.float().std(0).max() < 1:  # one colour correlates with nothing
         return
     views = (*scene.train, *scene.test)
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
@@ -216,9 +222,10 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         )
         report.suggestion = conventions[fits.index(best)].words
     elif stated < MIN_CORRELATION and report.suggestion is None:
-        report.notes.append(
-            f"the colours of points and panoramas correlate by only {stated:.2f}, and not better under any "
-            "other known convention; look at the overlay"
+        report.problems.append(
+            f"the colours of points and panoramas correlate by only {stated:.2f} (at least {MIN_CORRELATION} if they "
+            "agree), and under no other known convention better; look at the overlay. Are these the images, points and "
+            "poses of one reconstruction, with the names in the right order?"
         )
 
 

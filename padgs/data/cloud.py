@@ -2,50 +2,95 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import Capture, Cloud, DataError, color_bytes
+from padgs.data.capture import Capture, Cloud, DataError, refuse_special
 from padgs.files import atomic_path
 
-_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, after one of the prefixes; any case
+PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
+SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 1/2 + SH_C0 f_dc
+SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read a point cloud from a PLY file: x, y, z and optional red, green, blue (0..255, or floats in 0..1).
+    """Read a point cloud from a PLY file: x, y, z, and colours if there are any (`color_bytes`, or `SH_CHANNELS`).
 
     Raises:
         DataError: missing file, no PLY file, truncated, or without x, y, z.
     """
     vertex, names = read_vertices(path)
-    if not {"x", "y", "z"} <= names:
+    stored = {name.lower(): name for name in sorted(names)}
+
+    def columns(*wanted: str) -> NDArray[Any]:
+        return np.stack([np.asarray(vertex[stored[name]]) for name in wanted], axis=1)
+
+    if not {"x", "y", "z"} <= stored.keys():
         raise DataError(f"{path} has the properties {', '.join(sorted(names))}; a point cloud needs x, y and z")
-    points = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    channels = next((group for group in _COLORS if set(group) <= names), None)
+    groups = [[prefix + name for name in group] for prefix in PREFIXES for group in CHANNELS]
+    channels = next((group for group in groups if set(group) <= stored.keys()), None)
+    packed = next((name for name in ("rgb", "rgba") if name in stored), None)
     colors = None
     if channels is not None:
-        values = np.stack([np.asarray(vertex[channel]) for channel in channels], axis=1)
-        if values.dtype.kind == "f" and len(values) and values.max() <= 1:
-            values = values * 255
-        colors = color_bytes(torch.from_numpy(values.astype(np.float64)), str(path))
-    return Cloud(torch.from_numpy(points), colors)
+        colors = color_bytes(columns(*channels), str(path))
+    elif set(SH_CHANNELS) <= stored.keys():
+        colors = color_bytes((0.5 + SH_C0 * columns(*SH_CHANNELS)).clip(0, 1), str(path))
+    elif packed and (bits := columns(packed)).itemsize == 4:  # PCL: 0xAARRGGBB, stored as an integer or a float
+        colors = color_bytes((bits.view(np.uint32) >> np.array([16, 8, 0], np.uint32)).astype(np.uint8), str(path))
+    return Cloud(torch.from_numpy(columns("x", "y", "z").astype(np.float64)), colors)
+
+
+def color_bytes(values: NDArray[Any], where: str) -> Tensor:
+    """Scale colours [P, 3] to uint8 by the range of their type: 1 for floats, 255 or 65535 for whole numbers.
+
+    Fields of 16 bits often hold colours of 8 bits, and floats those of integers. The range is therefore the smallest
+    that holds the median value (without black). A few values outside the range are clamped.
+
+    Raises:
+        DataError: a colour is not finite; `where` names the file.
+    """
+    if not (finite := np.isfinite(values).all(1)).all():
+        raise DataError(f"the colour of point {(~finite).nonzero()[0][0]} of {where} is not finite; repair the cloud")
+    if values.dtype == np.int8:
+        values = values.view(np.uint8)
+    ranges = (1, 255, 65535)
+    if values.dtype.kind in "iu":
+        largest = int(np.iinfo(values.dtype).max)
+        ranges = sorted({bound for bound in (255, 65535, largest) if bound <= largest})
+    typical = np.median(values[values > 0]) if (values > 0).any() else 0
+    scale = 255 / next((bound for bound in ranges if typical <= bound), ranges[-1])
+    return torch.from_numpy(np.rint(values.astype(np.float64) * scale).clip(0, 255).astype(np.uint8))
+
+
+def whole_if_possible(values: NDArray[np.float64]) -> NDArray[Any]:
+    """Return numbers of a text file as integers if all are whole, because text states no type."""
+    return values.astype(np.int64) if (values == np.rint(values)).all() and (abs(values) < 2**53).all() else values
 
 
 def read_vertices(path: Path) -> tuple[Any, set[str]]:
-    """Return the vertices of a PLY file, one column per property, and the property names.
+    """Return the vertices of a PLY file, one column per property, and the names of properties that are numbers.
 
     Raises:
         DataError: missing file, no PLY file, truncated, or without vertices.
     """
-    from plyfile import PlyData, PlyParseError
+    from plyfile import PlyData, PlyListProperty, PlyParseError
 
+    refuse_special(path)
     try:
-        vertex = PlyData.read(str(path))["vertex"]  # memory-mapped; reading 500 000 Gaussians row by row takes minutes
+        try:
+            data = PlyData.read(str(path))  # memory-mapped; reading 500 000 Gaussians row by row takes minutes
+        except UnicodeDecodeError:  # a comment; plyfile reads ASCII only
+            header, end, rest = path.read_bytes().partition(b"end_header")
+            data = PlyData.read(BytesIO(header.decode("ascii", "replace").encode("ascii", "replace") + end + rest))
+        vertex = data["vertex"]
     except FileNotFoundError as error:
         raise DataError(f"the point cloud {path} does not exist") from error
     except KeyError as error:
@@ -54,7 +99,7 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
         raise DataError(
             f"{path} is not a readable PLY file ({error or type(error).__name__}); export it again"
         ) from error
-    return vertex, {prop.name for prop in vertex.properties}
+    return vertex, {prop.name for prop in vertex.properties if not isinstance(prop, PlyListProperty)}
 
 
 def write_ply(path: Path, cloud: Cloud) -> None:
@@ -64,7 +109,7 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     columns, fields = [*cloud.points.T.numpy()], [(axis, "f8") for axis in "xyz"]
     if cloud.colors is not None:
         columns += [*cloud.colors.T.numpy()]
-        fields += [(channel, "u1") for channel in _COLORS[0]]
+        fields += [(channel, "u1") for channel in CHANNELS[0]]
     vertex = np.rec.fromarrays(columns, dtype=fields)
     with atomic_path(path) as draft:
         PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(draft))

@@ -90,6 +90,7 @@ def known_conventions() -> list[Convention]:
         "the rotations are transposed: transpose them and keep the centres": _transposed,
         "the translations are camera centres: use t = -R t": _from_center,
         "the camera centres are translations: use C = -R^T C": _to_center,
+        "the quaternions are in the order x y z w: write them as w x y z": _reordered,
     }
     same, *others = _signed_axes()
     found = []
@@ -127,6 +128,14 @@ def _from_center(poses: Tensor) -> Tensor:
 
 def _to_center(poses: Tensor) -> Tensor:
     return _with(poses, poses[:, :3, :3], centers(poses)[..., None])
+
+
+def _reordered(poses: Tensor) -> Tensor:
+    """Return poses whose quaternion (w, x, y, z) was stated as x y z w."""
+    from scipy.spatial.transform import Rotation
+
+    stated = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(scalar_first=True)
+    return _with(poses, torch.from_numpy(Rotation.from_quat(stated).as_matrix()), poses[:, :3, 3:])
 
 
 def _with(poses: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:

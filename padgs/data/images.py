@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from padgs.data.capture import DataError, listed
+from padgs.data.capture import DataError, listed, refuse_special
 from padgs.data.image_metadata import (
     Crop,
     crop_of,
@@ -195,21 +195,20 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a file.
+def read_bytes(path: Path, *, empty: bool = False) -> bytes:
+    """Read a file, which may be `empty` if that is allowed.
 
     Raises:
-        DataError: missing, unreadable or empty.
+        DataError: missing, unreadable, empty, or a folder, pipe or device, which could be read without end.
     """
-    if path.exists() and not path.is_file():
-        raise DataError(f"{path} cannot be read: it is no regular file; replace or remove it")
+    refuse_special(path)
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:
         raise DataError(f"{path} does not exist") from error
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror}); check its permissions") from error
-    if not data:
+    if not data and not empty:
         raise DataError(f"{path} is empty (0 bytes); copy it again or remove it")
     return data
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from unicodedata import normalize
 
 from padgs.data.capture import DataError, listed
+from padgs.data.images import EXTENSIONS, read_bytes
 
 MAX_NAME_BYTES = 255  # of a file name
 LISTS = {"train": "train.txt", "test": "test.txt"}
@@ -81,40 +83,55 @@ def read_list(path: Path) -> tuple[str, ...]:
     """Read the names in a list file: one a line, blank lines skipped, any line ending, optional byte-order mark.
 
     Raises:
-        DataError: no text file, or a name points outside the image folder.
+        DataError: no text file.
     """
-    names = tuple(line.strip().replace("\\", "/") for line in read_lines(path) if line.strip())
-    for name in names:
-        check_inside(name, f"{path}")
-    return names
+    return tuple(check_name(line.strip(), str(path)) for line in read_lines(path) if line.strip())
 
 
 def read_lines(path: Path, errors: str = "strict") -> list[str]:
     """Read the lines of a text file; `errors` is that of `bytes.decode`.
 
     Raises:
-        DataError: not UTF-8, or unreadable.
+        DataError: not UTF-8, or unreadable; see `read_bytes`.
     """
     try:
-        return path.read_text(encoding="utf-8-sig", errors=errors).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        return read_bytes(path, empty=True).decode("utf-8-sig", errors).splitlines()
+    except UnicodeDecodeError as error:
         raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as UTF-8") from error
 
 
-def check_inside(name: str, where: str) -> str:
-    """Return a relative name that stays inside its folder; lists from elsewhere must not reach other files.
+def is_inside(name: str) -> bool:
+    """Return whether a name is relative and stays inside its folder: names must not reach files elsewhere."""
+    parts = PurePosixPath(name.replace("\\", "/"))
+    absolute = parts.is_absolute() or PureWindowsPath(name).drive
+    return not absolute and ".." not in parts.parts and bool(parts.name) and "\0" not in name
+
+
+def check_name(name: str, where: str) -> str:
+    """Return a name that a file system can hold.
 
     Raises:
-        DataError: the name is absolute, contains `..`, is not Unicode, or is too long; `where` names its source.
+        DataError: the name is not Unicode, or too long; `where` names its source.
     """
-    parts = PurePosixPath(name.replace("\\", "/"))
-    if parts.is_absolute() or PureWindowsPath(name).drive or ".." in parts.parts or not parts.name or "\0" in name:
-        raise DataError(f"{where} names {name!r}; names must be relative and stay inside the image folder (no '..')")
     if any(0xD800 <= ord(character) < 0xE000 for character in name):
         raise DataError(f"{where} names {name!r}, which is not Unicode; rename the file, and export again")
-    if any(len(part.encode()) > MAX_NAME_BYTES for part in parts.parts):
+    if any(len(part.encode()) > MAX_NAME_BYTES for part in PurePosixPath(name.replace("\\", "/")).parts):
         raise DataError(f"{where} names {name[:60]!r}...; file names have at most {MAX_NAME_BYTES} bytes: rename it")
     return name
+
+
+def spellings(name: str) -> Iterator[str]:
+    """Yield what a stated name may mean: itself, then its ends, each with and without extension; "/" between folders.
+
+    >>> list(spellings("C:\\\\scan\\\\a.jpg"))
+    ['C:/scan/a.jpg', 'C:/scan/a', 'scan/a.jpg', 'scan/a', 'a.jpg', 'a']
+    """
+    parts = normalize("NFC", name).replace("\\", "/").split("/")
+    for start in range(len(parts)):
+        end = "/".join(parts[start:])
+        yield end
+        if end.lower().endswith(EXTENSIONS):
+            yield end.rpartition(".")[0]
 
 
 def _every(names: Sequence[str], every: int, mode: str) -> Split:
@@ -129,15 +146,15 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
 
 
 def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str]) -> set[int]:
-    exact = {name: {i} for i, name in enumerate(names)}
-    loose: dict[str, set[int]] = {}
+    meant: dict[str, set[int]] = {}
     for i, name in enumerate(names):
-        for key in _keys(name):
-            loose.setdefault(key, set()).add(i)
+        for key in spellings(name):
+            meant.setdefault(key, set()).add(i)
+    meant |= {normalize("NFC", name): {i} for i, name in enumerate(names)}
     chosen: set[int] = set()
     absent: list[str] = []
     for line in lines:
-        found = exact.get(line) or loose.get(line) or loose.get(PurePosixPath(line).name) or set()
+        found = next((meant[key] for key in spellings(line) if key in meant), set())
         if len(found) > 1:
             raise DataError(
                 f"the {which} names {line!r}, which matches {listed(names[i] for i in sorted(found))}; be specific"
@@ -146,17 +163,11 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
             absent.append(line)
         chosen |= found
     if absent:
-        known = {key for name in unposed for key in (name, *_keys(name))}
-        without = [line for line in absent if line in known]
+        known = {key for name in unposed for key in spellings(name)}
+        without = [line for line in absent if known & set(spellings(line))]
         if without:
             raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
         raise DataError(
             f"the {which} names images that do not exist: {listed(absent)}; the data set has {listed(names)}"
         )
     return chosen
-
-
-def _keys(name: str) -> set[str]:
-    """Return the short forms of a frame's name in lists: without extension, without folders, without both."""
-    path = PurePosixPath(name)
-    return {str(path.with_suffix("")), path.name, path.stem}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from support.fixtures import World, write_colmap_text
 from torch import Tensor
 
@@ -37,6 +38,13 @@ MISREADINGS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "translation for centre": (
         lambda poses: _pose(poses[:, :3, :3], -poses[:, :3, :3] @ poses[:, :3, 3:]),
         "the camera centres are translations",
+    ),
+    "x y z w": (
+        lambda poses: _pose(
+            Rotation.from_quat(Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(), scalar_first=True).as_matrix(),
+            poses[:, :3, 3:],
+        ),
+        "the quaternions are in the order x y z w",
     ),
     "OpenGL inverse": (lambda poses: torch.linalg.inv(FLIP @ poses), "world from camera: invert them; camera axes"),
     "turned cloud": (lambda poses: poses @ Z_UP.T, r"different world frames: rotate the points, use \(x, z, -y\)"),
@@ -78,7 +86,7 @@ def test_reprojection_errors_wrap_and_shrink_near_poles() -> None:
 
 def test_conventions_are_distinct() -> None:
     words = [convention.words for convention in known_conventions()]
-    assert len(set(words)) == len(words) == 5 * 48 + 47
+    assert len(set(words)) == len(words) == 6 * 48 + 47
 
 
 def _poses(world: World) -> Tensor:
@@ -87,7 +95,7 @@ def _poses(world: World) -> Tensor:
 
 def _pose(rotation: Tensor, translation: Tensor) -> Tensor:
     pose = torch.eye(4, dtype=torch.float64).repeat(len(rotation), 1, 1)
-    pose[:, :3, :3], pose[:, :3, 3:] = rotation, translation
+    pose[:, :3, :3], pose[:, :3, 3:] = torch.as_tensor(rotation), translation
     return pose
 
 

@@ -1,11 +1,14 @@
+import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from support.fixtures import World, write_cloud
 
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import read_ply, write_ply
+from padgs.data.formats.json_file import read_json
 
 
 def test_write_and_read_lose_nothing(tmp_path: Path, generator: torch.Generator) -> None:
@@ -52,6 +55,90 @@ def test_invalid_files_are_refused(world: World, tmp_path: Path) -> None:
     path.write_text("ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n")
     with pytest.raises(DataError, match="has no element 'vertex'"):
         read_ply(path)
+
+
+def _write(path: Path, columns: dict[str, tuple[str, list[float]]], comment: bytes = b"") -> Path:
+    """Write a binary PLY of one point per value, with x, y, z in front; columns are name -> (NumPy type, values)."""
+    kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "i4": "int"}
+    kinds["u4"] = "uint"
+    count = len(next(iter(columns.values()))[1])
+    columns = {axis: ("f4", [0.5] * count) for axis in "xyz"} | columns
+    table = np.zeros(count, [(name, f"<{kind}") for name, (kind, _) in columns.items()])
+    for name, (_, values) in columns.items():
+        table[name] = values
+    header = "".join(f"property {kinds[kind]} {name}\n" for name, (kind, _) in columns.items())
+    start = b"ply\nformat binary_little_endian 1.0\n" + comment + f"element vertex {count}\n".encode()
+    path.write_bytes(start + f"{header}end_header\n".encode() + table.tobytes())
+    return path
+
+
+EIGHT_BIT = [0, 1, 100, 200, 255]
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale", "odd"),
+    [
+        ("u1", 1, None),
+        ("i1", 1, None),
+        ("u2", 257, None),
+        ("u2", 1, 256),  # colours of 8 bits in a field of 16, and one value outside
+        ("i2", 32767 / 255, None),
+        ("i4", 1, 1000),
+        ("i4", 257, None),
+        ("u4", 16843009, None),
+        ("f4", 1 / 255, 1.02),
+        ("f4", 1 / 255, 40.0),
+        ("f8", 1, 300.0),
+        ("f4", 257, None),
+    ],
+)
+def test_colours_are_scaled_by_the_range_of_their_type(kind: str, scale: float, odd: float | None, tmp_path: Path):
+    values = np.array([value * scale for value in EIGHT_BIT])
+    if kind == "i1":
+        values = np.array(EIGHT_BIT, np.uint8).view(np.int8)
+    stored = list(values if kind[0] == "f" else np.rint(values)) + ([] if odd is None else [odd])
+    path = _write(tmp_path / "a.ply", {name: (kind, stored) for name in ("red", "green", "blue")})
+    expected = EIGHT_BIT + ([] if odd is None else [255])
+    assert read_ply(path).colors[:, 1].tolist() == expected  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["r g b", "Red Green Blue", "RED GREEN BLUE", "R G B", "diffuse_red diffuse_green diffuse_blue"]
+    + ["scalar_Red scalar_Green scalar_Blue", "scalar_R scalar_G scalar_B"],
+)
+def test_names_of_colours(names: str, tmp_path: Path) -> None:
+    columns = {name: ("f4", [value, 90.0]) for name, value in zip(names.split(), (10.0, 20.0, 30.0), strict=True)}
+    found = read_ply(_write(tmp_path / "a.ply", columns, "comment Örtliche Koordinaten\n".encode()))
+    assert found.colors.tolist() == [[10, 20, 30], [90, 90, 90]]  # type: ignore[union-attr]
+
+
+def test_colours_of_gaussians_and_packed_colours(tmp_path: Path) -> None:
+    columns = {f"f_dc_{i}": ("f4", [(value / 255 - 0.5) / 0.28209479, 9]) for i, value in enumerate((10, 20, 30))}
+    assert read_ply(_write(tmp_path / "a.ply", columns)).colors.tolist() == [[10, 20, 30], [255] * 3]  # type: ignore
+    packed = np.array([0x0A141E, 0xFF5A5A5A], np.uint32)
+    for name, values in (("rgb", packed.view(np.float32)), ("rgba", packed)):
+        path = _write(tmp_path / "a.ply", {name: ("f4" if name == "rgb" else "u4", list(values))})
+        assert read_ply(path).colors.tolist() == [[10, 20, 30], [90, 90, 90]]  # type: ignore[union-attr]
+
+
+def test_axes_in_capitals_and_lists(tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float X\nproperty float Y\nproperty float Z\n"
+    (tmp_path / "a.ply").write_text(f"{header}property list uchar int extra\nend_header\n1 2 3 2 7 8\n")
+    assert read_ply(tmp_path / "a.ply").points.tolist() == [[1, 2, 3]]
+    header = header.replace("property float X", "property list uchar float x")
+    (tmp_path / "a.ply").write_text(f"{header}end_header\n2 1 1 2 3\n")
+    with pytest.raises(DataError, match="a.ply has the properties Y, Z; a point cloud needs x, y and z"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_pipes_and_folders_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.ply")
+    for path in (tmp_path / "pipe.ply", tmp_path):
+        with pytest.raises(DataError, match="it is no regular file"):
+            read_ply(path)
+        with pytest.raises(DataError, match="it is no regular file"):
+            read_json(path)
 
 
 def test_huge_counts_do_not_allocate_memory(tmp_path: Path) -> None:

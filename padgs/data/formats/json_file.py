@@ -16,7 +16,7 @@ from torch import Tensor
 
 from padgs.data.capture import DataError, listed
 from padgs.data.images import read_bytes
-from padgs.data.splits import check_inside
+from padgs.data.splits import check_name, is_inside, spellings
 
 LARGEST = 2**53  # largest range of exact integers in floats
 
@@ -59,8 +59,22 @@ class Json:
         return int(value)
 
     def name(self) -> str:
-        """Return a relative path that stays inside its folder."""
-        return check_inside(self.text(), self.where)
+        """Return the name of a file."""
+        return check_name(self.text(), self.where)
+
+    def path_in(self, folder: Path) -> Path:
+        """Return the file of a name, which may be found by its end, in a folder.
+
+        Raises:
+            DataError: the name points outside the folder, and no end of it is there.
+        """
+        name = self.name()
+        if is_inside(name) and (folder / name).is_file():
+            return folder / name
+        found = [folder / end for end in spellings(name) if is_inside(end) and (folder / end).is_file()]
+        if not found and not is_inside(name):
+            raise DataError(f"{self.where} names {name!r}; names must be relative and stay inside the folder (no '..')")
+        return (found or [folder / name])[0]
 
     def numbers(self, *shape: int) -> Tensor:
         """Return a nested list of numbers as a float64 tensor, of the given shape if there is one.
@@ -90,7 +104,7 @@ def read_json(path: Path) -> Json:
         DataError: missing, unreadable or not JSON; the message names the line.
     """
     try:
-        return Json(json.loads(read_bytes(path).decode("utf-8-sig")), str(path))
+        return Json(json.loads(read_bytes(path)), str(path))
     except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, huge numbers, deep nesting
         raise DataError(f"{path} is not valid JSON ({error}); export it again") from error
 

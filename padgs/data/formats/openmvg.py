@@ -16,7 +16,7 @@ from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tr
 from padgs.data.cloud import first_ply
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center
-from padgs.data.splits import check_inside
+from padgs.data.splits import check_name
 
 _PLY = ("colorized.ply", "scene.ply", "pcd.ply")
 
@@ -70,7 +70,7 @@ def read_views(data: Json) -> list[MvgView]:
         view = item["value"]["ptr_wrapper"]["data"]
         local, name = view.get("local_path"), view["filename"].text()
         folder = local.text().strip("/") if local else ""
-        name = check_inside(f"{folder}/{name}" if folder else name, data.where)
+        name = check_name(f"{folder}/{name}" if folder else name, data.where)
         key = item["key"].whole()
         pose = view.get("id_pose") or item["key"]
         views.append(MvgView(key, pose.whole(), name, view["width"].whole(), view["height"].whole()))

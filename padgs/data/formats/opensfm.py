@@ -10,10 +10,11 @@ from pathlib import Path
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, color_bytes
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame
+from padgs.data.cloud import color_bytes, whole_if_possible
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_world, rotation_from_vector
-from padgs.data.splits import check_inside
+from padgs.data.splits import check_name
 
 MODELS = ("spherical", "equirectangular")
 
@@ -35,7 +36,7 @@ def read(path: Path, options: DataOptions) -> Capture:
             raise DataError(f"{shot.where} has a {model!r} camera; only spherical cameras (panoramas) can be used")
         rotation = rotation_from_vector(shot["rotation"].numbers(3), shot.where)
         pose = cam_from_world(rotation, shot["translation"].numbers(3), shot.where)
-        name = check_inside(name, str(file))
+        check_name(name, str(file))
         width, height = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
         frames.append(Frame(name, images / name, pose, width, height))
     used = f"{file.name} holds {len(parts)} reconstructions; the one with the most shots, {len(frames)}, is used"
@@ -54,5 +55,5 @@ def _cloud(part: Json) -> Cloud | None:
     stated = [point.get("color") for point in points]
     if all(stated):
         values = Json([color.value for color in stated if color], f"color of {where}").numbers(len(points), 3)
-        colors = color_bytes(values, where)
+        colors = color_bytes(whole_if_possible(values.numpy()), where)
     return Cloud(positions.numbers(len(points), 3), colors)

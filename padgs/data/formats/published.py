@@ -15,17 +15,18 @@ test.txt. Views and extrinsics are joined by key; sizes are those of the images.
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from padgs.data.assemble import image_folder, image_names
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame
 from padgs.data.cloud import first_ply
 from padgs.data.datasets import DATASETS
-from padgs.data.formats.colmap import pose_of, read_images, read_points
+from padgs.data.formats.colmap import pose_of
+from padgs.data.formats.colmap_files import read_images, read_points
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.openmvg import read_extrinsics, read_views
 from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose
-from padgs.data.splits import check_inside
+from padgs.data.splits import check_name
 
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
@@ -38,8 +39,7 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
     for side in ("train", "test"):
         names = []
         for item in data[side].entries():
-            stated = item["rgb_file"].name()
-            name = stated if (images / stated).is_file() else PurePosixPath(stated).name
+            name = item["rgb_file"].name()
             matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
             frames.append(Frame(name, images / name, cam_from_pose(matrix.numbers(4, 4), matrix.where)))
             names.append(name)
@@ -58,20 +58,17 @@ _RICOH360_MODEL = "output_dir/colmap"
 def read_ricoh360(path: Path, options: DataOptions) -> Capture:
     """Read poses and points of a Ricoh360 scene."""
     images = image_folder(path, options.images, ("imgs", "images"))
-    files = {str(PurePosixPath(name).with_suffix("")): name for name in image_names(images)}
-    files.pop("mask", None)
     mask = path / "imgs" / "mask.png"
     file = path / _RICOH360_MODEL / "images.txt"
     frames = []
     for image in read_images(file):
-        name = check_inside(image.name, str(file))
-        name = files.get(str(PurePosixPath(name).with_suffix("")), name)
+        name = check_name(image.name, str(file))
         pose = pose_of(image, f"{name} in {file}")
         frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
     cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
     points = path / _RICOH360_MODEL / "points3D.txt"
     if cloud is None and points.is_file():
-        _, cloud = read_points(points)
+        cloud = read_points(points).cloud
     return Capture("ricoh360", path, images, tuple(frames), cloud)
 
 

@@ -13,7 +13,7 @@ from padgs.data.cloud import first_ply, read_ply
 from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
-from padgs.data.images import EXTENSIONS
+from padgs.data.splits import is_inside
 
 FILE = "transforms.json"
 SIDES = {"train": "transforms_train.json", "test": "transforms_test.json"}
@@ -52,7 +52,7 @@ def read(path: Path, options: DataOptions) -> Capture:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
     named = first.get("ply_file_path")
-    cloud = read_ply(folder / named.name()) if named else first_ply(folder, _PLY)
+    cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
     return Capture(
         format="transforms",
         folder=folder,
@@ -84,9 +84,6 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
             f"{meta.where}: {name} has camera_model {model!r}; only EQUIRECTANGULAR panoramas can be used "
             "(set camera_model if these are panoramas)"
         )
-    if not PurePosixPath(name).suffix:  # as in files of Blender
-        found = [f"{name}{extension}" for extension in EXTENSIONS if (root / f"{name}{extension}").is_file()]
-        name = found[0] if found else f"{name}.png"
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]
     mask = frame.get("mask_path")
     width, height = (frame.get(key) or meta.get(key) for key in ("w", "h"))
@@ -96,7 +93,7 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
         cam_from_world=cam_from_opengl_pose(matrix.numbers(), matrix.where),
         width=width and width.whole(),
         height=height and height.whole(),
-        mask=mask and root / _name(mask),
+        mask=mask and mask.path_in(root),
     )
 
 
@@ -106,5 +103,5 @@ def _name(path: Json) -> str:
 
 def _shared_folder(names: list[str]) -> str:
     """Return the folder that holds all images, "" if there is none: "images" for images/a.jpg, images/b.jpg."""
-    folders = {str(PurePosixPath(name).parent) for name in names}
-    return folders.pop() if len(folders) == 1 and "." not in folders else ""
+    first, *others = {str(PurePosixPath(name).parent) for name in names} or {"."}
+    return "" if others or first == "." or not is_inside(first) else first

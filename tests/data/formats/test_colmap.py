@@ -1,11 +1,12 @@
 """COLMAP models: written by hand, damaged, and real."""
 
 import shutil
+import struct
 from pathlib import Path
 
 import pytest
 import torch
-from support.fixtures import World, write_colmap_binary, write_colmap_text
+from support.fixtures import World, write_cloud, write_colmap_binary, write_colmap_text
 
 from padgs.data import DataError, load, read
 from padgs.geometry.panorama import project
@@ -43,7 +44,7 @@ def test_names_that_differ_in_case_are_reported(world: World, tmp_path: Path) ->
         load(tmp_path)
 
 
-@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
 @pytest.mark.parametrize("damage", ["cut", "garbage", "longer"])
 def test_damaged_binary_files_are_named(file: str, damage: str, world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
@@ -75,6 +76,108 @@ def test_a_model_with_a_file_missing(world: World, tmp_path: Path) -> None:
     (tmp_path / "sparse/0/points3D.txt").unlink()
     with pytest.raises(DataError, match="lacks points3D"):
         load(tmp_path)
+
+
+def _rewrite(folder: Path, file: str, change) -> None:
+    path = folder / "sparse/0" / file
+    path.write_text(change(path.read_text()))
+
+
+def _notes(folder: Path) -> str:
+    return "\n".join(load(folder).notes)
+
+
+def test_references_to_what_is_absent_are_left_out(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    _rewrite(tmp_path, "images.txt", lambda text: text.replace(".png\n", ".png\n1.5 2.5 7 3.5 4.5 70001 5 6 -1\n"))
+    _rewrite(tmp_path, "points3D.txt", lambda text: text.replace(" 0.1\n", " 0.1 1 0 99 0\n"))
+    notes = _notes(tmp_path)
+    assert "6 of 12 observations are of points that the model does not hold; they are left out" in notes
+    assert "points name 1 images that the model does not hold (id 99)" in notes
+    tracks = read(tmp_path).tracks()  # type: ignore[misc]
+    assert tracks.frame.tolist() == list(range(6)) and tracks.pixels[0].tolist() == [1.5, 2.5]
+    write_colmap_binary(world, tmp_path / "b")
+    model = tmp_path / "b/sparse/0"
+    text = (model / "points3D.bin").read_bytes()
+    (model / "points3D.bin").write_bytes((399).to_bytes(8, "little") + text[8 : -(len(text) - 8) // 400])
+    assert "6 of 2400 observations are of points" in _notes(tmp_path / "b")
+
+
+@pytest.mark.parametrize("second", ["", "\n", "1 2 7\n", "1 2 -1 3 4 7\n"])
+def test_second_lines_of_images_txt_may_be_missing(second: str, world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    _rewrite(tmp_path, "images.txt", lambda text: "\ufeff" + text.replace(".png\n\n", f".png\n{second}"))
+    assert len(read(tmp_path).frames) == 6
+    _rewrite(tmp_path, "images.txt", lambda text: text.replace("pano_01.png", ""))
+    with pytest.raises(DataError, match=r"images.txt, line \d+: .* is not ID QW QX QY QZ TX TY TZ CAMERA NAME"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("camera", ["SPHERE 64 32 1 32 16", "EQUIRECTANGULAR 64 32 64 32", "SPHERICAL 64 32"])
+def test_names_of_the_panoramic_camera(camera: str, world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    _rewrite(tmp_path, "cameras.txt", lambda text: f"1 {camera}\n")
+    assert read(tmp_path).frames[0].width == 64
+    _rewrite(tmp_path, "cameras.txt", lambda text: "1 SPHERE 64 32 1 30 16\n")
+    with pytest.raises(DataError, match=r"cameras.txt, line 1: CX CY of a SPHERE are \[30.0, 16.0\]"):
+        load(tmp_path)
+
+
+def test_binary_sphere_cameras(world: World, tmp_path: Path) -> None:
+    write_colmap_binary(world, tmp_path)
+    file = tmp_path / "sparse/0/cameras.bin"
+    file.write_bytes(struct.pack("<QIiQQ3d", 1, 1, 11, 64, 32, 1, 32, 16))
+    assert read(tmp_path).frames[0].height == 32
+    file.write_bytes(struct.pack("<QIiQQ16d", 1, 1, 11, 64, 32, *range(16)))
+    with pytest.raises(DataError, match="pano_00.png has a type 11 camera"):
+        load(tmp_path)
+
+
+def test_names_that_are_not_utf_8_name_their_file(world: World, tmp_path: Path) -> None:
+    write_colmap_binary(world, tmp_path)
+    file = tmp_path / "sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"pano_03", b"\xb3\xf8o_03"))
+    with pytest.raises(DataError, match=r"images.bin names .*, which is not Unicode; rename the file"):
+        load(tmp_path)
+
+
+def test_points_may_be_a_ply_file_beside_the_model(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    (tmp_path / "sparse/0/points3D.txt").unlink()
+    with pytest.raises(DataError, match="lacks points3D .*or set data.points to a PLY file or to random"):
+        load(tmp_path)
+    assert len(load(tmp_path, points="random").points) == 100_000
+    write_cloud(world, tmp_path / "sparse/0/points3D.ply")
+    assert torch.equal(load(tmp_path).point_colors, torch.from_numpy(world.colors))
+    assert "points: from a PLY file beside the model" in _notes(tmp_path)
+
+
+def test_old_frames_beside_new_images_are_reported(world: World, tmp_path: Path) -> None:
+    write_colmap_binary(world, tmp_path)
+    assert "state other poses" not in _notes(tmp_path)
+    file = tmp_path / "sparse/0/images.bin"
+    data = bytearray(file.read_bytes())
+    data[44:52] = struct.pack("<d", 0.25)  # tx of the first image
+    file.write_bytes(data)
+    assert "rigs.bin and frames.bin state other poses than images.bin (pano_00.png); those of images" in _notes(
+        tmp_path
+    )
+    assert read(tmp_path).frames[0].cam_from_world[0, 3] == 0.25
+    text = tmp_path / "text"
+    write_colmap_text(world, text)
+    (text / "sparse/0/rigs.txt").write_text("# rigs\n1 2 CAMERA 1 CAMERA 2 1 1 0 0 0 0 0 0\n")
+    poses = [(text / "sparse/0/images.txt").read_text().splitlines()[4 + 2 * i].split()[1:8] for i in range(6)]
+    frames = "".join(f"{i + 1} 1 {' '.join(poses[i])} 1 CAMERA 1 {i + 1}\n" for i in range(6))
+    (text / "sparse/0/frames.txt").write_text(frames)
+    assert "state other poses" not in _notes(text)
+    (text / "sparse/0/frames.txt").write_text(frames.splitlines()[0])
+    assert "(pano_01.png, pano_02.png, pano_03.png, pano_04.png, pano_05.png)" in _notes(text)
+
+
+def test_text_and_binary_in_one_folder(world: World, tmp_path: Path) -> None:
+    write_colmap_binary(world, tmp_path)
+    (tmp_path / "sparse/0/images.txt").write_text("1 0 0 0 0 0 0 0 1 other.png")
+    assert "images.bin are used, not the text files" in _notes(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ BROKEN: dict[str, tuple[Change, str]] = {
     "ragged": (lambda m: m["frames"][0]["transform_matrix"][1].pop(), "not an array of numbers"),
     "outside": (
         lambda m: m["frames"][0].update(file_path="../../secret.png"),
-        "names '../../secret.png'; names",
+        "names '../../secret.png'; names must be relative",
     ),
     "outside cloud": (lambda m: m.update(ply_file_path="/etc/passwd"), "names '/etc/passwd'; names must be relative"),
     "no cloud": (lambda m: m.update(ply_file_path="absent.ply"), "the point cloud .*absent.ply does not exist"),
@@ -196,7 +196,7 @@ def test_files_that_are_not_json(name: str, file: str, world: World, tmp_path: P
     [
         ("openmvg", "sfm_data.json", "spherical", "pinhole_radial_k3", "a 'pinhole_radial_k3' camera; only spherical"),
         ("opensfm", "reconstruction.json", '"spherical"', '"perspective"', "a 'perspective' camera; only spherical"),
-        ("released", "data_views.json", "pano_00.png", "../pano_00.png", "names '../pano_00.png'"),
+        ("released", "data_views.json", "pano_00.png", "../else.png", "names '../else.png'; names must"),
         ("roam360", "pose_c2w.json", '"pano_01.jpg"', '"pano_00.jpg"', "pano_00.jpg is both a train and a test view"),
     ],
 )

@@ -1,0 +1,269 @@
+"""Files of COLMAP models, text and binary. Source: the description of COLMAP's output format, 3.x and 4.x."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from padgs.data.capture import Cloud, DataError
+from padgs.data.cloud import color_bytes, whole_if_possible
+from padgs.data.images import read_bytes
+from padgs.data.splits import read_lines
+
+SENSORS = {"CAMERA": "0", "IMU": "1"}  # text -> binary
+NO_POINT = -1  # point of an observation without one
+FILES = ("cameras", "images", "points3D")
+PANORAMIC = ("EQUIRECTANGULAR", "SPHERICAL", "SPHERE")
+EQUIRECTANGULAR = 17  # id of the camera model in binary files
+SPHERE = 11  # its id in SphereSfM; in COLMAP a camera with 16 parameters
+PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4}
+PARAMETERS |= {16: 6, EQUIRECTANGULAR: 2}  # numbers of parameters of the camera models
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An entry of the cameras file."""
+
+    model: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Image:
+    """An entry of the images file."""
+
+    id: int
+    pose: tuple[float, ...]  # quaternion w x y z, then translation; cam from world
+    camera: int
+    name: str
+    pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))  # [K, 2] observations
+    points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [K] their point ids
+
+
+class Points(NamedTuple):
+    """The points file."""
+
+    row_of: dict[int, int]  # point id -> row of the cloud
+    cloud: Cloud | None
+    images: frozenset[int]  # ids of the images that see a point
+
+
+def find_file(model: Path, stem: str) -> Path | None:
+    """Return a file of a model, binary or text; None if it has neither."""
+    return next((file for end in (".bin", ".txt") if (file := model / f"{stem}{end}").is_file()), None)
+
+
+def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
+    """Read the cameras file: id and camera."""
+    if file.suffix == ".txt":
+        for number, line in _lines(file):
+            words, kinds = line.split(), (int, str, int, int)
+            key, model, width, height = _fields(file, number, words, kinds, "ID MODEL WIDTH HEIGHT")
+            if model == "SPHERE":
+                _, *center = _fields(file, number, words[4:], (float,) * 3, "F CX CY after ID SPHERE WIDTH HEIGHT")
+                if center != [width / 2, height / 2]:
+                    raise DataError(f"{file}, line {number}: CX CY of a SPHERE are {center}; they must be its middle")
+            yield key, Camera(model, width, height)
+        return
+
+    def entry(cursor: _Cursor) -> tuple[int, Camera]:
+        key, model, width, height = cursor.take("IiQQ")
+        if model not in PARAMETERS:
+            raise DataError(f"{file} holds a camera of type {model}; only EQUIRECTANGULAR (17) can be used here")
+        center = struct.pack("<2d", width / 2, height / 2)
+        is_sphere = model == SPHERE and cursor.data[cursor.offset + 8 : cursor.offset + 24] == center
+        cursor.take("24x" if is_sphere else f"{8 * PARAMETERS[model]}x")
+        return key, Camera(PANORAMIC[0] if is_sphere or model == EQUIRECTANGULAR else f"type {model}", width, height)
+
+    yield from _entries(file, entry)
+
+
+def read_images(file: Path) -> Iterator[Image]:
+    """Read the images file. In text, the line of observations after an image may be empty or missing.
+
+    Raises:
+        DataError: a damaged file; the message names the line.
+    """
+    if file.suffix == ".txt":
+        kinds, image = (int, *[float] * 7, int, str), None
+        for number, line in _lines(file):
+            seen = _observations(line) if image else None
+            if image:
+                yield image if seen is None else replace(image, pixels=seen[:, :2], points=seen[:, 2].astype(np.int64))
+                image = None
+            if seen is None:
+                fields = _fields(file, number, line.split(None, 9), kinds, "ID QW QX QY QZ TX TY TZ CAMERA NAME")
+                image = Image(fields[0], tuple(fields[1:8]), *fields[8:])
+        if image:
+            yield image
+        return
+
+    def entry(cursor: _Cursor) -> Image:
+        key, *pose, camera = cursor.take("I7dI")
+        name = cursor.text()
+        seen = cursor.array([("pixel", "<f8", 2), ("point", "<i8")])
+        return Image(key, tuple(pose), camera, name, seen["pixel"], seen["point"])
+
+    yield from _entries(file, entry)
+
+
+def read_points(file: Path) -> Points:
+    """Read the points file."""
+    seen_by: set[int] = set()
+    if file.suffix == ".txt":
+        kinds, rows = (int, *[float] * 6), []
+        for number, line in _lines(file):
+            values, track = line.split()[:7], line.split()[8::2]
+            rows.append(_fields(file, number, values, kinds, "ID X Y Z R G B"))
+            seen_by.update(_fields(file, number, track, (int,) * len(track), "a track of IMAGE POINT2D ..."))
+    else:
+
+        def entry(cursor: _Cursor) -> tuple[Any, ...]:
+            values = cursor.take("Q3d3B8x")
+            seen_by.update(cursor.array([("image", "<u4"), ("observation", "<u4")])["image"].tolist())
+            return values
+
+        rows = _entries(file, entry)
+    rows.sort(key=lambda row: row[0])
+    values = np.array([row[1:] for row in rows], np.float64).reshape(-1, 6)
+    colors = color_bytes(whole_if_possible(values[:, 3:]), str(file))
+    cloud = Cloud(torch.from_numpy(values[:, :3].copy()), colors)
+    return Points({row[0]: i for i, row in enumerate(rows)}, cloud, frozenset(seen_by))
+
+
+def read_frames(model: Path) -> tuple[list[str], dict[int, NDArray[np.float64]]]:
+    """Read the poses that frames and rigs (COLMAP 4) state beside those of the images file.
+
+    Returns:
+        The names of the files that are there, and image id -> cam_from_world [4, 4].
+    """
+    from scipy.spatial.transform import Rotation
+
+    def matrix(pose: Sequence[float]) -> NDArray[np.float64]:
+        found = np.eye(4)
+        if np.isfinite(pose).all() and any(pose[:4]):
+            found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), pose[4:]
+        return found
+
+    def rig(cursor: _Cursor | _Words) -> tuple[int, dict[tuple[int, int], NDArray[np.float64] | None]]:
+        key, count = cursor.take("II")
+        sensors = {}  # type and id -> sensor_from_rig
+        for number in range(count):
+            sensor = cursor.take("iI")
+            has_pose = number and cursor.take("B")[0]
+            sensors[sensor] = matrix(cursor.take("7d")) if has_pose else None if number else np.eye(4)
+        return key, sensors
+
+    def frame(cursor: _Cursor | _Words) -> tuple[int, NDArray[np.float64], list[tuple[int, int, int]]]:
+        _, key, *pose, count = cursor.take("II7dI")
+        return key, matrix(pose), [cursor.take("iIQ") for _ in range(count)]
+
+    files = [file for stem in ("rigs", "frames") if (file := find_file(model, stem))]
+    if len(files) < 2:
+        return [], {}
+    rigs = dict(_entries(files[0], rig))
+    poses = {}
+    for key, rig_from_world, data in _entries(files[1], frame):
+        for kind, sensor, image in data:
+            sensor_from_rig = rigs.get(key, {}).get((kind, sensor))
+            if kind == 0 and sensor_from_rig is not None:
+                poses[image] = sensor_from_rig @ rig_from_world
+    return [file.name for file in files], poses
+
+
+def _lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text file that are neither empty nor comments, with their numbers."""
+    for number, line in enumerate(read_lines(file, errors="surrogateescape"), 1):
+        if line.strip() and not line.startswith("#"):
+            yield number, line.strip()
+
+
+def _fields(file: Path, number: int, fields: list[str], kinds: tuple[type, ...], names: str) -> list[Any]:
+    try:
+        return [kind(field) for kind, field in zip(kinds, fields[: len(kinds)], strict=True)]
+    except ValueError as error:
+        raise DataError(f"{file}, line {number}: {' '.join(fields)[:60]!r} is not {names}; export it again") from error
+
+
+def _observations(line: str) -> NDArray[np.float64] | None:
+    """Return observations [K, 3] (x, y, point), or None if the line is not of observations."""
+    try:
+        seen = np.array(line.split(), np.float64).reshape(-1, 3)
+    except ValueError:
+        return None
+    return seen if (seen[:, 2] == np.rint(seen[:, 2])).all() else None
+
+
+class _Cursor:
+    """Position in a binary file."""
+
+    def __init__(self, file: Path) -> None:
+        self.data, self.offset = read_bytes(file), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.data, self.offset)
+        self.offset += struct.calcsize(f"<{layout}")
+        return values
+
+    def text(self) -> str:
+        start, self.offset = self.offset, self.data.find(b"\0", self.offset) + 1 or len(self.data)
+        return self.data[start : self.offset - 1].decode("utf-8", "surrogateescape")
+
+    def array(self, dtype: list[Any]) -> NDArray[Any]:
+        """Read a number of entries, then the entries."""
+        (count,) = self.take("Q")
+        if count > len(self.data):
+            raise IndexError
+        whole = self.data[self.offset : self.offset + count * np.dtype(dtype).itemsize]
+        self.take(f"{count * np.dtype(dtype).itemsize}x")
+        return np.frombuffer(whole, dtype)
+
+
+class _Words:
+    """Position in a line of a text file, with the layouts of `_Cursor`."""
+
+    def __init__(self, line: str) -> None:
+        self.words = iter(line.split())
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        kinds = layout.replace("7d", 7 * "d")
+        words = [SENSORS.get(word, word) for word in islice(self.words, len(kinds))]
+        return tuple(float(word) if kind == "d" else int(word) for kind, word in zip(kinds, words, strict=True))
+
+
+def _entries(file: Path, entry: Callable[[Any], T]) -> list[T]:
+    """Read the entries of a binary file, or the lines of a text file.
+
+    Raises:
+        DataError: the file is truncated, or longer than its entries.
+    """
+    if file.suffix == ".txt":
+        found = []
+        for number, line in _lines(file):
+            try:
+                found.append(entry(_Words(line)))
+            except ValueError as error:
+                raise DataError(f"{file}, line {number} is not an entry ({error}); export the model again") from error
+        return found
+    cursor = _Cursor(file)
+    try:
+        (count,) = cursor.take("Q")
+        found = [entry(cursor) for _ in range(count)]
+    except (struct.error, IndexError, OverflowError) as error:
+        raise DataError(f"{file} ends early or is not a COLMAP file; copy it again or rebuild the model") from error
+    if cursor.offset != len(cursor.data):
+        raise DataError(
+            f"{file} has {len(cursor.data)} bytes but its {count} entries take {cursor.offset}; copy it again"
+        )
+    return found
