@@ -21,7 +21,8 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from padgs.checks import install_command
-from padgs.data.camera_paths import PATHS, gravity, read_path
+from padgs.data.camera_paths import PATHS, gravity
+from padgs.data.formats.path_file import read_path
 from padgs.data.formats.transforms import transforms_file
 from padgs.evaluation.images import depth_image, to_uint8
 from padgs.files import atomic_path, draft_of
@@ -65,7 +66,7 @@ def views_along(
     else:
         height, fov = perspective_shape
         width = width or trained.width // 2
-        lens = perspective(width, height or 2 * round(width * 9 / 32), fov)
+        lens = perspective(width, 2 * round(width * 9 / 32) if height is None else height, fov)
     frames = None if seconds is None else max(2, round(seconds * fps))
     if path in PATHS:
         poses = PATHS[path](scene, frames or max(2, round(10 * fps)))

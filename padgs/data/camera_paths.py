@@ -1,18 +1,9 @@
-"""Camera paths: statistics of poses, paths through a scene, and paths read from JSON files.
-
-Poses are cam_from_world [F, 4, 4] float64. Keyframe files of padgs: {"keyframes": [{"position": [x, y, z], "look_at":
-[x, y, z]} or {"cam_from_world": 4 rows of 4}, ...], "up": [x, y, z]}, in the world of the data set. Camera paths of
-nerfstudio's viewer hold one pose per frame (x right, y up, z backward) in a normalised world, which the run's
-`dataparser_transforms.json` defines; put that file beside the path.
-"""
+"""Camera paths: statistics of poses, and paths through a scene. Poses are cam_from_world [F, 4, 4] float64."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -170,91 +161,4 @@ def _frame(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _poses(rotations: np.ndarray, centers: np.ndarray) -> Tensor:
     poses = np.tile(np.eye(4), (len(rotations), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rotations, -np.einsum("fij,fj->fi", rotations, centers)
-    return torch.from_numpy(poses)
-
-
-TRANSFORMS = "dataparser_transforms.json"
-
-
-class PathError(ValueError):
-    """An unusable path file; the message says what is wrong."""
-
-
-def read_path(
-    file: Path, frames: int | None, up: tuple[float, float, float], transforms_json: Path | None = None
-) -> Tensor:
-    """Read the poses [F, 4, 4] of a path file.
-
-    Args:
-        file: keyframes, or a camera path of nerfstudio.
-        frames: number of poses, resampled evenly; None: a camera path as it is, or 30 poses between two keyframes.
-        up: default up direction of keyframes with look_at.
-        transforms_json: the `transforms.json` from which the scene was read, if any.
-
-    Raises:
-        PathError: unreadable file, or of neither kind.
-    """
-    try:
-        content = json.loads(file.read_text())
-    except FileNotFoundError as error:
-        raise PathError(f"the path {file} does not exist; known: cameras, orbit, dolly, or a JSON file") from error
-    except (OSError, ValueError) as error:
-        raise PathError(f"{file} is not readable JSON: {error}") from error
-    try:
-        if "camera_path" in content:
-            poses = _nerfstudio(content["camera_path"], file.parent / TRANSFORMS, transforms_json)
-        else:
-            poses = torch.cat([_keyframe(entry, content.get("up", up)) for entry in content["keyframes"]])
-            frames = frames or 30 * (len(poses) - 1)
-    except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
-        raise PathError(
-            f"{file} is not a camera path ({type(error).__name__}: {error}); it needs keyframes with position "
-            "and look_at, or nerfstudio's camera_path with camera_to_world"
-        ) from error
-    if len(poses) < 2:
-        raise PathError(f"{file} has {len(poses)} poses; a path needs at least two")
-    return poses if frames is None else interpolate_poses(poses, np.linspace(0, len(poses) - 1, frames))
-
-
-def _keyframe(entry: dict[str, Any], up: Any) -> Tensor:
-    if "cam_from_world" in entry:
-        return _rigid(np.array(entry["cam_from_world"], dtype=np.float64).reshape(1, 4, 4))
-    position, target = (np.array([entry[name]], dtype=np.float64).reshape(1, 3) for name in ("position", "look_at"))
-    up = np.array(up, dtype=np.float64).reshape(3)
-    if not np.isfinite([*position, *target, up]).all():
-        raise ValueError(f"position, look_at or up is not finite: {position[0]}, {target[0]}, {up}")
-    if (position == target).all() or not up.any():
-        raise ValueError(
-            f"position and look_at are both {position[0]}, or up is 0; give different positions and a non-zero up"
-        )
-    return look_along(position, target - position, up / np.linalg.norm(up))
-
-
-def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path, transforms_json: Path | None) -> Tensor:
-    world_from_cam = np.array([camera["camera_to_world"] for camera in cameras], dtype=np.float64).reshape(-1, 4, 4)
-    world_from_cam[:, :3, 1:3] *= -1  # to y down, z forward
-    if transforms.is_file():  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
-        normalized = json.loads(transforms.read_text())
-        applied = {} if transforms_json is None else json.loads(transforms_json.read_text(encoding="utf-8-sig"))
-        applied_transform = _homogeneous(applied.get("applied_transform", np.eye(3, 4)))
-        transform = _homogeneous(normalized["transform"]) @ np.linalg.inv(applied_transform)
-        scale = normalized["scale"] / applied.get("applied_scale", 1.0)
-        world_from_cam[:, :3, 3] = (world_from_cam[:, :3, 3] / scale - transform[:3, 3]) @ transform[:3, :3]
-        world_from_cam[:, :3, :3] = transform[:3, :3].T @ world_from_cam[:, :3, :3]
-    return _rigid(np.linalg.inv(world_from_cam))
-
-
-def _homogeneous(rows: Any) -> np.ndarray:
-    return np.vstack((np.array(rows, dtype=np.float64).reshape(3, 4), (0, 0, 0, 1)))
-
-
-def _rigid(poses: np.ndarray) -> Tensor:
-    rotations = poses[:, :3, :3]
-    if not np.isfinite(poses).all():
-        raise ValueError("a pose is not finite")
-    if (
-        not np.allclose(rotations @ rotations.swapaxes(1, 2), np.eye(3), atol=1e-3)
-        or np.linalg.det(rotations).min() < 0
-    ):
-        raise ValueError("a pose has a 3x3 part that is not a rotation")
     return torch.from_numpy(poses)

@@ -131,9 +131,11 @@ def _to_center(poses: Tensor) -> Tensor:
 
 
 def _reordered(poses: Tensor) -> Tensor:
-    """Return poses whose quaternion (w, x, y, z) was stated as x y z w."""
+    """Return poses whose quaternion (w, x, y, z) was stated as x y z w; mirrored poses have none and are returned."""
     from scipy.spatial.transform import Rotation
 
+    if torch.linalg.det(poses[:, :3, :3]).min() <= 0:
+        return poses
     stated = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(scalar_first=True)
     return _with(poses, torch.from_numpy(Rotation.from_quat(stated).as_matrix()), poses[:, :3, 3:])
 

@@ -2,7 +2,9 @@
 
 import json
 import math
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,6 @@ from support.tiny_scene import tiny_scene
 
 from padgs.data.camera_paths import (
     PATHS,
-    PathError,
     along_cameras,
     centers,
     gravity,
@@ -20,8 +21,9 @@ from padgs.data.camera_paths import (
     look_along,
     median_depth,
     path_length,
-    read_path,
 )
+from padgs.data.capture import DataError
+from padgs.data.formats.path_file import read_path
 from padgs.scene import Scene
 
 
@@ -168,26 +170,43 @@ def test_nerfstudio_paths_are_converted_to_the_scene(applied, tmp_path):
     assert np.allclose(found.numpy(), np.linalg.inv(ours))
 
 
+KEY = '{"position": [0, 0, 0], "look_at": [1, 0, 0]}'
+ROWS = "[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is not readable JSON"),
-        ("[1]", "is not a camera path"),
-        ('{"keyframes": [{"position": [0, 0, 0]}]}', "is not a camera path .KeyError: 'look_at'"),
-        ('{"keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}', "has 1 poses; a path needs at least two"),
+        ("{", "is not valid JSON"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("", "is empty"),
+        ("[1]", "must be an object, not list"),
+        ("{}", "lacks the field 'keyframes'"),
+        ('{"keyframes": [{"position": [0, 0, 0]}]}', "entry 0 of keyframes of .* lacks the field 'look_at'"),
+        (f'{{"keyframes": [{KEY}]}}', "has 1 poses; a path needs at least two"),
         (
             '{"keyframes": [{"position": [1, 2, 3], "look_at": [1, 2, 3]}]}',
             "give different positions and a non-zero up",
         ),
-        ('{"up": [0, 0, 0], "keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}', "or up is 0"),
-        ('{"keyframes": [{"position": [NaN, 0, 0], "look_at": [1, 0, 0]}]}', "is not finite"),
-        ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "is not a camera path"),
-        ('{"camera_path": [{"camera_to_world": [2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}]}', "that is not a rotation"),
+        (f'{{"up": [0, 0, 0], "keyframes": [{KEY}]}}', "or up is 0"),
+        (f'{{"up": "z", "keyframes": [{KEY}]}}', "up of .* is not an array of numbers"),
+        (KEY.join(('{"keyframes": [', "]}")).replace("1", "NaN"), "is not finite"),
+        (KEY.join(('{"keyframes": [', "]}")).replace("1", '"1"'), "look_at of .* is not an array of numbers"),
+        (KEY.join(('{"keyframes": [', "]}")).replace("1", "true"), "look_at of .* is not an array of numbers"),
+        (f'{{"keyframes": [{{"cam_from_world": [{ROWS}, [0, 0, 0, 2]]}}]}}', "last row .* must be 0 0 0 1"),
+        (f'{{"keyframes": [{{"cam_from_world": [{ROWS}]}}]}}', r"shape \[3, 4\]; it must be \[4, 4\]"),
+        ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "has 2 numbers; a pose has 16"),
+        ('{"camera_path": [{"camera_to_world": [2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}]}', "is not a rotation"),
+        ('{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,2]}]}', "must be 0 0 0 1"),
     ],
 )
 def test_invalid_path_files_are_refused(text, message, tmp_path):
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(PathError, match=message):
+    with pytest.raises(DataError, match=message):
         read_path(tmp_path / "a.json", None, UP)
-    with pytest.raises(PathError, match="does not exist; known: cameras, orbit, dolly, or a JSON file"):
+    with pytest.raises(DataError, match="does not exist; known: cameras, orbit, dolly, or a JSON file"):
         read_path(tmp_path / "orbti", None, UP)
+    os.mkfifo(tmp_path / "pipe")
+    for special in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
+        with pytest.raises(DataError, match="it is no regular file"):
+            read_path(special, None, UP)

@@ -82,6 +82,8 @@ class Json:
         Raises:
             DataError: not numbers, or another shape.
         """
+        if not _is_numbers(self.value):
+            raise DataError(f"{self.where} is not an array of numbers; texts, booleans and nulls are none")
         try:
             tensor = torch.tensor(self.value, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -95,6 +97,10 @@ class Json:
         if not isinstance(self.value, kind):
             raise DataError(f"{self.where} must be {words}, not {type(self.value).__name__}")
         return self.value
+
+
+def _is_numbers(value: Any) -> bool:
+    return all(map(_is_numbers, value)) if isinstance(value, list) else type(value) in (int, float)
 
 
 def read_json(path: Path) -> Json:

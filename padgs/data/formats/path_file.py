@@ -1,0 +1,94 @@
+"""Camera paths in JSON files.
+
+Keyframe files of padgs: {"keyframes": [{"position": [x, y, z], "look_at": [x, y, z]} or {"cam_from_world": 4 rows of
+4}, ...], "up": [x, y, z]}, in the world of the data set. Camera paths of nerfstudio's viewer hold one pose per frame (x
+right, y up, z backward) in a normalised world, which the run's `dataparser_transforms.json` defines; put that file
+beside the path.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from padgs.data.camera_paths import PATHS, interpolate_poses, look_along
+from padgs.data.capture import DataError
+from padgs.data.formats.json_file import Json, read_json
+from padgs.data.formats.poses import OPENCV_FROM_OPENGL, cam_from_pose, rigid
+
+TRANSFORMS = "dataparser_transforms.json"
+
+
+def read_path(
+    file: Path, frames: int | None, up: tuple[float, float, float], transforms_json: Path | None = None
+) -> Tensor:
+    """Read the poses [F, 4, 4] of a path file.
+
+    Args:
+        file: keyframes, or a camera path of nerfstudio.
+        frames: number of poses, resampled evenly; None: a camera path as it is, or 30 poses between two keyframes.
+        up: default up direction of keyframes with look_at.
+        transforms_json: the `transforms.json` from which the scene was read, if any.
+
+    Raises:
+        DataError: unreadable file, or of neither kind; the message names the place in the file.
+    """
+    if not file.exists():
+        raise DataError(f"the path {file} does not exist; known: {', '.join(PATHS)}, or a JSON file")
+    content = read_json(file)
+    if cameras := content.get("camera_path"):
+        poses = _nerfstudio(cameras, file.parent / TRANSFORMS, transforms_json)
+    else:
+        stated = content.get("up")
+        upwards = stated.numbers(3) if stated else torch.tensor(up, dtype=torch.float64)
+        poses = [_keyframe(entry, upwards) for entry in content["keyframes"].entries()]
+        frames = frames or 30 * (len(poses) - 1)
+    if len(poses) < 2:
+        raise DataError(f"{file} has {len(poses)} poses; a path needs at least two")
+    found = torch.stack(poses)
+    return found if frames is None else interpolate_poses(found, np.linspace(0, len(poses) - 1, frames))
+
+
+def _keyframe(entry: Json, up: Tensor) -> Tensor:
+    if pose := entry.get("cam_from_world"):
+        return torch.linalg.inv(cam_from_pose(pose.numbers(4, 4), pose.where))
+    position, target = entry["position"].numbers(3), entry["look_at"].numbers(3)
+    if not torch.cat((position, target, up)).isfinite().all():
+        raise DataError(f"{entry.where}: position, look_at or up is not finite; give numbers")
+    if position.equal(target) or not up.any():
+        raise DataError(
+            f"{entry.where}: position and look_at are both {position.tolist()}, or up is 0; give different positions "
+            "and a non-zero up"
+        )
+    return look_along(position[None].numpy(), (target - position)[None].numpy(), (up / up.norm()).numpy())[0]
+
+
+def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -> list[Tensor]:
+    scale, transform = 1.0, torch.eye(4, dtype=torch.float64)
+    if transforms.is_file():  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
+        normalized = read_json(transforms)
+        applied = Json({}, "") if transforms_json is None else read_json(transforms_json)
+        before, factor = applied.get("applied_transform"), applied.get("applied_scale")
+        transform = _homogeneous(normalized["transform"])
+        if before:
+            transform = transform @ torch.linalg.inv(_homogeneous(before))
+        scale = normalized["scale"].numbers().item() / (factor.numbers().item() if factor else 1.0)
+    poses = []
+    for entry in cameras.entries():
+        stated = entry["camera_to_world"]
+        world_from_cam = stated.numbers()
+        if world_from_cam.numel() != 16:
+            raise DataError(f"{stated.where} has {world_from_cam.numel()} numbers; a pose has 16")
+        world_from_cam = world_from_cam.reshape(4, 4)
+        world_from_cam[:3, 3] = transform[:3, :3].T @ (world_from_cam[:3, 3] / scale - transform[:3, 3])
+        world_from_cam[:3, :3] = transform[:3, :3].T @ world_from_cam[:3, :3] @ OPENCV_FROM_OPENGL
+        poses.append(cam_from_pose(world_from_cam, stated.where))
+    return poses
+
+
+def _homogeneous(rows: Json) -> Tensor:
+    matrix = rows.numbers(3, 4)
+    return rigid(matrix[:, :3], matrix[:, 3])
