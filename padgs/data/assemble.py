@@ -143,7 +143,7 @@ def found_images(capture: Capture) -> Capture:
     if all(there):
         return capture
     folder = next(folder for folder in (capture.image_folder, *capture.image_folder.parents) if folder.is_dir())
-    if folder == capture.folder:
+    if folder == capture.folder and not any(there):
         folder = image_folder(folder, None)
     meant: dict[str, set[str]] = {}
     for file in image_names(folder):
@@ -155,7 +155,9 @@ def found_images(capture: Capture) -> Capture:
         files = next((meant[key] for key in spellings(frame.name) if key in meant), set())
         if not is_there and len(files) == 1:
             (found[frame.name],) = files
-    taken = Counter(found.values())
+    taken = Counter(
+        [*found.values(), *(frame.name for frame, is_there in zip(capture.frames, there, strict=True) if is_there)]
+    )
     found = {name: file for name, file in found.items() if taken[file] == 1}
     for frame in capture.frames:
         if frame.name not in found and not is_inside(frame.name):

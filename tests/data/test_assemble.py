@@ -1,5 +1,6 @@
 """Assembly of scenes: sizes, names, points, notes and fingerprints."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.fixtures import World, write_colmap_text
+from support.fixtures import World, write_colmap_text, write_transforms
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
 
@@ -148,3 +149,64 @@ def test_generated_scenes_need_no_path(path: str | None, format: str) -> None:
 def test_a_data_set_needs_a_path():
     with pytest.raises(DataError, match=r"data.path is not set; .* \+scene=roam360_bar"):
         load(dataset="roam360")
+
+
+@pytest.fixture
+def transforms(world: World, tmp_path: Path) -> Path:
+    write_transforms(world, tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+def _name(folder: Path, old: str, new: str) -> None:
+    file = folder / "transforms.json"
+    file.write_text(file.read_text().replace(f'"{old}', json.dumps(new)[:-1]))
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    ["/home/x/flat/images/", "C:\\scans\\images\\", "..\\images\\", "../../", "images\\", "./images/", "frames/"],
+)
+def test_names_are_taken_by_their_end(prefix: str, transforms: Path) -> None:
+    names = [view.name for view in load(transforms).test]
+    _name(transforms, "images/", prefix)
+    scene = load(transforms)
+    assert [view.name for view in scene.test] == names and len(scene.train) == 4
+    differs = prefix not in ("images\\", "./images/")
+    assert differs == any(note.startswith("images: 6 names differ from their files in folders") for note in scene.notes)
+
+
+def test_names_without_image_say_what_differs(transforms: Path) -> None:
+    _name(transforms, "images/pano_00", "/home/x/else")
+    with pytest.raises(
+        DataError, match="names '/home/x/else.png'; names must be relative .*remove the leading folders"
+    ):
+        load(transforms)
+    _name(transforms, "/home/x/else", "/home/x/pano_01")
+    with pytest.raises(DataError, match="names '/home/x/pano_01.png'; names must be relative"):
+        load(transforms)  # the image of another frame
+
+
+def test_smaller_copies_and_other_extensions(world: World, transforms: Path) -> None:
+    (transforms / "images_2").mkdir()
+    for name, image in zip(world.names, world.images, strict=True):
+        Image.fromarray(image[::2, ::2]).save(transforms / "images_2" / f"{name}.JPG")
+    scene = load(transforms, images="images_2")
+    assert scene.train[0].width == 32 and [view.name for view in scene.test] == list(world.test)
+    assert any("'pano_00.png' is images_2/pano_00.JPG" in note for note in scene.notes)
+
+
+def test_unicode_forms_of_names(folder: Path) -> None:
+    composed, decomposed = "k\u00fcche", "ku\u0308che"
+    for path in (folder / "images").iterdir():
+        path.rename(path.with_name(path.name.replace("pano", decomposed)))
+    for file in ("sparse/0/images.txt", "train.txt", "test.txt"):
+        (folder / file).write_text((folder / file).read_text().replace("pano", composed), encoding="utf-8")
+    assert [view.name for view in load(folder).test] == [f"{decomposed}_01", f"{decomposed}_04"]
+
+
+def test_two_files_for_one_name_are_not_chosen_from(transforms: Path) -> None:
+    for extension in ("webp", "bmp"):
+        shutil.copy(transforms / "images/pano_00.png", transforms / f"images/other.{extension}")
+    _name(transforms, "images/pano_00", "images/other")
+    with pytest.raises(DataError, match="1 of 6 poses have no image in .*: other.png"):
+        load(transforms)

@@ -12,18 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.fixtures import WRITERS, World, write_colmap_text, write_transforms
-from typer import Typer
 from typer.testing import CliRunner
 
-from padgs.cli import check as check_command
-from padgs.cli import convert as convert_command
-from padgs.cli.errors import without_traceback
+from padgs.cli.commands import app
 from padgs.data import load
 from padgs.data.check import check
-
-app = Typer()
-app.command()(without_traceback(check_command.check))
-app.command()(without_traceback(convert_command.convert))
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -90,6 +83,14 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "empty cloud": (lambda f: (f / "sparse/0/points3D.txt").write_text("\n"), "holds no points; training starts"),
     "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "images.bin ends early"),
+    "masks inverted": (
+        lambda f: _save(f, "mask.png", np.pad(np.full((3, 64), 255, np.uint8), ((29, 0), (0, 0)))),
+        r"the masks of 6 views hide more than 50% of the image: pano_00 \(90.6%\), .*; in a mask 255 means use",
+    ),
+    "images of another place": (
+        lambda f: _shuffle_colours(f),
+        r"colours of points and panoramas correlate by only -?0.\d\d .* and under no other known convention better",
+    ),
     "other axes": (lambda f: _rotate_points(f), "colours correlate by -?0.* and by 0.9. under another convention"),
 }
 
@@ -154,7 +155,7 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         bad.exit_code == 1 and "PROBLEM" in bad.output and "pano_02.png" in bad.output and "1 problem(s)" in bad.output
     )
     assert run(app, ["check", str(tmp_path / "absent"), "--overlay", ""]).exit_code == 1
-    assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).output
+    assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).stderr
 
 
 def test_the_convert_command(world: World, tmp_path: Path) -> None:
@@ -164,10 +165,18 @@ def test_the_convert_command(world: World, tmp_path: Path) -> None:
     assert good.exit_code == 0 and "4 train and 2 test views, 400 points, as transforms" in good.output
     assert load(tmp_path / "b").train[0].width == 32
     again = run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--to", "colmap"])
-    assert again.exit_code == 1 and "nothing is overwritten" in again.output
+    assert again.exit_code == 1 and "nothing is overwritten" in again.stderr
     assert (
-        "unknown format 'obj'" in run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "c"), "--to", "obj"]).output
+        "unknown format 'obj'" in run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "c"), "--to", "obj"]).stderr
     )
+
+
+def _shuffle_colours(folder: Path) -> None:
+    """Give the points the colours of other points."""
+    file = folder / "sparse/0/points3D.txt"
+    rows = [line.split() for line in file.read_text().splitlines() if not line.startswith("#")]
+    order = np.random.default_rng(0).permutation(len(rows))
+    file.write_text("".join(" ".join([*row[:4], *rows[k][4:]]) + "\n" for row, k in zip(rows, order, strict=True)))
 
 
 def _rotate_points(folder: Path) -> None:
