@@ -224,7 +224,8 @@ class Multirun:
             self._rows.append((self._titles[index], state.run))
             line = f"{self._titles[index] or state.run}: {', '.join(summary(state.status, self._result(state.run)))}"
             more = status_line(self.before, [*self.states.values()], time.monotonic() - self._began)
-            self._say(f"{line}; {more}" if self._in_process else line)
+            is_last = all(one.ended for one in self.states.values())
+            self._say(f"{line}; {more}" if self._in_process and not is_last else line)
 
     def _result(self, run: str) -> Result | None:
         with suppress(ResultError):

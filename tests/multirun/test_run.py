@@ -82,7 +82,7 @@ def test_killed_and_interrupted_runs_end_bit_identically(start, tmp_path, method
         process.send_signal(number)
         code, _, error = finish(process)
         if number != signal.SIGKILL and code != 0:  # 0: the run was faster than the signal
-            assert code == 130 and "to go on: padgs-run" in error, error
+            assert code == 128 + number and "to go on: padgs-run" in error, error
     code, out, error = finish(start(*arguments, "run.folder=disturbed"))
     assert code == 0, error
     same_end(tmp_path / "disturbed", tmp_path / "undisturbed")

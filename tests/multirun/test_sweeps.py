@@ -59,7 +59,7 @@ def test_a_sweep_that_was_killed_three_times_ends_as_if_nothing_had_been(start, 
             os.killpg(process.pid, number)  # all of them, as a terminal does
         code, _, error = finish(process)
         if number != signal.SIGKILL and code != 0:  # 0: the sweep was faster than the signal
-            assert code == 130 and "to go on: padgs-run" in error, error
+            assert code == 128 + number and "to go on: padgs-run" in error, error
     code, out, error = finish(start(*TINY, *SWEEP, "run.folder=disturbed", f"launcher={launcher}"))
     assert code == 0, out + error
     assert marks(tmp_path / "disturbed") == expected
