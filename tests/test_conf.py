@@ -129,7 +129,7 @@ def test_the_tables_of_the_paper_are_all_of_its_scenes_times_all_of_its_methods(
         assert {pair["+scene"] for pair in pairs} == scenes
         assert len(pairs) == len(scenes) * len({pair["method"] for pair in pairs})
         first, _ = first_and_last_job(f"+experiment={name}")
-        folder = DATASETS[known].title.casefold()
+        folder = DATASETS[known].folder
         assert first.data.path == f"data/{folder}/{DATASETS[known].scenes[0]}" and first.data.dataset == known
         assert first.train.iterations == 30_000 and first.labels.experiments == (name,)
 

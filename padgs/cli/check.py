@@ -88,7 +88,7 @@ def lines(report: Report) -> list[str]:
         which = f"{len(shares)} of {report.train + report.test} views"
         out.append(f"  masked         {shares[0]:.1%} to {shares[-1]:.1%} of each image, in {which}")
     if report.overlay is not None:
-        out.append(f"  overlay        {report.overlay}")
+        out.append(f"  overlay        {report.overlay}: points on a panorama, red = near, blue = far")
     out += [f"  note           {note}" for note in report.notes]
     out += [f"  PROBLEM        {problem}" for problem in report.problems]
     if report.suggestion is not None:

@@ -16,6 +16,7 @@ class Dataset:
     """A published data set of panoramic scenes."""
 
     title: str
+    folder: str  # of its scenes, within data/
     scenes: tuple[str, ...]
     width: int  # of the paper's evaluation (OmniBlender is not in the paper)
     mask: str  # meaning of data.mask=auto
@@ -38,6 +39,7 @@ _OMNIBLENDER = (
 DATASETS = {
     "roam360": Dataset(
         title="360Roam",
+        folder="360roam",
         scenes=_ROAM360,
         width=2048,
         mask="rows:959/1024",
@@ -46,6 +48,7 @@ DATASETS = {
     ),
     "ricoh360": Dataset(
         title="Ricoh360",
+        folder="ricoh360",
         scenes=_RICOH360,
         width=1920,
         mask="none",
@@ -54,6 +57,7 @@ DATASETS = {
     ),
     "omniblender": Dataset(
         title="OmniBlender",
+        folder="omniblender",
         scenes=_OMNIBLENDER,
         width=2000,
         mask="none",
@@ -72,9 +76,7 @@ def refuse_missing(path: Path, dataset: str | None) -> None:
     if path.exists():
         return
     likely = [key for key, known in DATASETS.items() if path.name in known.scenes]
-    likely.sort(
-        key=lambda key: DATASETS[key].title.casefold() != path.parent.name.casefold()
-    )  # two data sets have a "center"
+    likely.sort(key=lambda key: DATASETS[key].folder != path.parent.name.casefold())  # two data sets have a "center"
     key = dataset or (likely[0] if likely else None)
     if key is None:
         raise DataError(f"{path.absolute()} does not exist; give the folder of panoramas and their poses")

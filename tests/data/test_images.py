@@ -14,6 +14,7 @@ from padgs import files
 from padgs.data import DataError
 from padgs.data.check import check
 from padgs.data.images import decode, inspect, is_dual_fisheye
+from padgs.data.prepare.pipeline import prepare
 from padgs.data.prepare.sources import find_source
 from padgs.geometry.panorama import sample
 from padgs.reports.store import split_image
@@ -234,6 +235,27 @@ def test_other_formats_are_refused_whatever_the_extension_says(kind, world, tmp_
     first = sorted((tmp_path / "world" / "images").iterdir())[0]
     first.write_bytes(path.read_bytes())
     assert any(f"{first.name} is not an image in JPEG, PNG" in text for text in check(tmp_path / "world").problems)
+
+
+def test_an_eps_file_is_not_run_by_prepare(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / "in" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "in" / name).write_bytes(EPS)
+    with pytest.raises(DataError, match=r"a.jpg is not an image in JPEG, PNG, .* \(it is EPS\)"):
+        prepare(tmp_path / "in", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_what_is_no_regular_file_is_not_read(kind, tmp_path):
+    for name in ("a.jpg", "tour.mp4"):
+        os.mkfifo(tmp_path / name) if kind == "pipe" else (tmp_path / name).symlink_to("/dev/zero")
+    for look in (inspect, decode, lambda path: split_image(path, 3)):
+        with pytest.raises((DataError, OSError), match=r"a.jpg .*no.* regular file"):
+            look(tmp_path / "a.jpg")
+    with pytest.raises(DataError, match=r"tour.mp4 cannot be read \(it is no regular file\)"):
+        prepare(tmp_path / "tour.mp4", tmp_path / "out")
 
 
 def test_images_beyond_the_limit_are_refused_with_the_limit(tmp_path, monkeypatch):
