@@ -40,9 +40,7 @@ def report(
         raise ReportError(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
     source = Path(runs)
     if not (source.is_dir() or source.is_file()):  # nor a device, which may have no end
-        raise ReportError(
-            f"there is no folder or file {source}; give the folder of the runs after the name of the report"
-        )
+        raise ReportError(f"there is no folder {source}; give the folder of the runs after the name of the report")
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from padgs.reports.frame import frame
     from padgs.reports.selection import Request, RunSet

@@ -43,7 +43,10 @@ def guard(token: str, *, is_local: bool) -> Iterator[list[int]]:
     def guarded_serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
         def process(connection: Any, request: Any) -> Any:
             asyncio.get_running_loop().set_exception_handler(_report)
-            response = process_request(connection, request)  # first, because it silences logs of refusals
+            try:
+                response = process_request(connection, request)  # first, because it silences logs of refusals
+            except Exception:  # of any path, such as one too long for a file
+                response = connection.respond(HTTPStatus.NOT_FOUND, "")
             cookie = f"padgs-{connection.local_address[1]}={token}"
             given = parse_qs(request.path.partition("?")[2]).get("token", [])
             cookies = [item.strip() for line in request.headers.get_all("Cookie") for item in line.split(";")]

@@ -265,8 +265,8 @@ def show_runs(server: Server, runs: Sequence[LoadedRun]) -> Iterator[dict[int, P
         DataError: the data set is missing.
     """
     warnings.filterwarnings(
-        "ignore", message="Queued .* on a closed connection"
-    )  # a browser was closed while rendering
+        "ignore", message=r"Queued .* on a closed connection|\[viser\]"
+    )  # a browser was closed while rendering; or values of a wrong type
     renderers, scene, viser = [RunRenderer(run) for run in runs], runs[0].scene, server.viser
     up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
     viser.scene.set_up_direction(up)
