@@ -139,11 +139,11 @@ def found_images(capture: Capture) -> Capture:
     Raises:
         DataError: a name points outside the image folder, and no end of it is there.
     """
-    there = [is_inside(frame.name) and os.path.isfile(frame.image) for frame in capture.frames]
-    if all(there):
+    there = {frame.name for frame in capture.frames if is_inside(frame.name) and os.path.isfile(frame.image)}
+    if len(there) == len(capture.frames):
         return capture
     folder = next(folder for folder in (capture.image_folder, *capture.image_folder.parents) if folder.is_dir())
-    if folder == capture.folder and not any(there):
+    if folder == capture.folder and not there:
         folder = image_folder(folder, None)
     meant: dict[str, set[str]] = {}
     for file in image_names(folder):
@@ -151,13 +151,11 @@ def found_images(capture: Capture) -> Capture:
         for key in (whole, *without[:1]):
             meant.setdefault(key, set()).add(file)
     found = {}  # stated name -> file
-    for frame, is_there in zip(capture.frames, there, strict=True):
-        files = next((meant[key] for key in spellings(frame.name) if key in meant), set())
-        if not is_there and len(files) == 1:
-            (found[frame.name],) = files
-    taken = Counter(
-        [*found.values(), *(frame.name for frame, is_there in zip(capture.frames, there, strict=True) if is_there)]
-    )
+    for name in (frame.name for frame in capture.frames if frame.name not in there):
+        files = next((meant[key] for key in spellings(name) if key in meant), set())
+        if len(files) == 1:
+            (found[name],) = files
+    taken = Counter([*found.values(), *there])
     found = {name: file for name, file in found.items() if taken[file] == 1}
     for frame in capture.frames:
         if frame.name not in found and not is_inside(frame.name):
@@ -188,8 +186,12 @@ def _refuse_missing(capture: Capture) -> None:
     present = {name.casefold(): name for name in image_names(capture.image_folder)}
     hint = next((present[name.casefold()] for name in absent if name.casefold() in present), None)
     remedy = "set data.images to the folder that holds them, or compute poses of the images that exist (padgs prepare)"
+    last_names = {PurePosixPath(name).name for name in absent}
+    elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).name in last_names), None)
     if hint:
         remedy = f"there is {hint!r}, which differs in case: rename it"
+    elif elsewhere:
+        remedy = f"{capture.folder / elsewhere} has the name of one: set data.images to the folder that holds them"
     raise DataError(
         f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}: "
         f"{listed(absent)}; {remedy}"

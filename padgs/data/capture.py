@@ -86,13 +86,12 @@ class Tracks:
 
     @classmethod
     def from_observations(cls, observations: Iterable[tuple[int, int, Any]]) -> Tracks:
-        """Build tracks from (frame, point, pixel) triples."""
+        """Build tracks from (frame, point, pixel) triples; pixels that are not finite are left out."""
         rows = list(observations)
-        return cls(
-            torch.tensor([frame for frame, _, _ in rows], dtype=torch.int64),
-            torch.tensor([point for _, point, _ in rows], dtype=torch.int64),
-            torch.from_numpy(np.array([pixel for _, _, pixel in rows], np.float64).reshape(-1, 2)),
-        )
+        pixels = np.array([pixel for _, _, pixel in rows], np.float64).reshape(-1, 2)
+        ids = np.array([row[:2] for row in rows], np.int64).reshape(-1, 2)
+        frame, point = torch.from_numpy(ids[finite := np.isfinite(pixels).all(1)].T.copy())
+        return cls(frame, point, torch.from_numpy(pixels[finite]))
 
 
 @dataclass(frozen=True)

@@ -200,11 +200,14 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
             fits = track_fit(poses, capture.cloud.points, tracks, width, height, conventions)
             if max(fits) >= -limit:
                 report.suggestion = conventions[fits.index(max(fits))].words
+    compared = report.coloured and scene.point_colors.float().std(0).max() >= 1  # one colour correlates with nothing
+    if not (compared or report.observations):
+        report.notes.append("poses are not compared with images: there are neither observations nor coloured points")
     if any("random points" in note for note in scene.notes):
         return
     if report.suggestion is None:
         _check_exposures(scene, report)
-    if not report.coloured or scene.point_colors.float().std(0).max() < 1:  # one colour correlates with nothing
+    if not compared:
         return
     views = (*scene.train, *scene.test)
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]

@@ -162,10 +162,10 @@ def _frame(image: Image, camera: Camera | None, folder: Path, model: Path) -> Fr
 
 
 def _tracks(images: list[Image], row_of: dict[int, int]) -> Tracks:
-    """Return the observations, in finite pixels, of points that exist."""
+    """Return the observations of points that exist."""
     return Tracks.from_observations(
         (frame, row_of[point], pixel)
         for frame, image in enumerate(images)
         for point, pixel in zip(image.points.tolist(), image.pixels, strict=True)
-        if point in row_of and np.isfinite(pixel).all()
+        if point in row_of
     )
