@@ -23,6 +23,8 @@ NOTES = (
     "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
     "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the test views, "
     "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
+    "At least: the smallest model that is not known to lose more, with 95 % confidence, where the interval of the minimal "
+    "count begins. By test views: the smallest model that loses no more on the test views.",
     "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
     "curves share.",
 )
@@ -121,12 +123,24 @@ def _knee(own: Curve, _: Curve) -> float | None:
     return None if own.found["knee"] is None else own.found["steps"][own.found["knee"]]["blended"]
 
 
+def _count(name: str) -> Callable[[Curve, Curve], float | None]:
+    """Return the count of a candidate that `padgs smallest` names for the stated loss; None in results without it."""
+
+    def count(own: Curve, _: Curve) -> float | None:
+        number = own.found.get(name, {}).get(STATED)
+        return None if number is None else own.found["steps"][number]["blended"]
+
+    return count
+
+
 COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],
     **{
         Column(f"minimal count for {loss:g} dB", 0, False): lambda own, _, e=f"{loss:g}": own.smallest[e]["blended"]
         for loss in SMALLEST_LOSSES
     },
+    Column(f"at least, for {STATED} dB", 0): _count("possible"),
+    Column(f"by test views, for {STATED} dB", 0): _count("by_test"),
     Column(f"share for {STATED} dB", 2): lambda own, _: own.smallest[STATED]["rows"] / own.found["rows"],
     Column("knee", 0): _knee,
     Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.smallest[STATED]["bytes"] / 1e6,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -113,23 +113,32 @@ class CoarseToFine:
 
 
 def halved(view: View) -> View:
-    """Return a panorama at half the width and height, each pixel the mean of those that it covers."""
-    width, height = view.width // 2, view.height // 2
+    """Return a panorama at half the width and height, each pixel the mean of those that it covers and no mask hides."""
+    width, height, pixels, mask = view.width // 2, view.height // 2, view.load_pixels, view.load_mask
 
-    def reduced(load: Callable[[], Tensor]) -> Tensor:
-        image = load()
-        planes = image.float().reshape(view.height, view.width, -1).permute(2, 0, 1)
-        small = interpolate(planes[None], (height, width), mode="area")[0].permute(1, 2, 0)
-        small = small.round().to(image.dtype) if image.dtype == torch.uint8 else small
-        return small.reshape(height, width, *image.shape[2:]).contiguous()
+    def mean(image: Tensor) -> Tensor:
+        return interpolate(image.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
 
-    pixels, mask = view.load_pixels, view.load_mask
+    def small_mask() -> Tensor:
+        assert mask is not None
+        return mean(mask()[..., None])[..., 0].contiguous()
+
+    def small_pixels() -> Tensor:
+        assert pixels is not None
+        image = pixels().float()
+        small = mean(image)
+        if mask is not None:
+            visible = mask()[..., None]
+            share = mean(visible)
+            small = torch.where(share > 0, mean(image * visible) / share.clamp(min=1e-6), small)
+        return small.round().to(torch.uint8).contiguous()
+
     return replace(
         view,
         width=width,
         height=height,
-        load_pixels=None if pixels is None else lambda: reduced(pixels),
-        load_mask=None if mask is None else lambda: reduced(mask),
+        load_pixels=None if pixels is None else small_pixels,
+        load_mask=None if mask is None else small_mask,
         load_depth=None,
     )
 

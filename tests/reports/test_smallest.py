@@ -35,7 +35,17 @@ def found(best: float, *, rows: str = "gaussians", each: int = 1) -> dict:
         for size, loss in zip(SIZES, lost, strict=True)
     ]
     minimal = {"0.05": 0, "0.1": 1, "0.25": 2, "0.5": 2, "1": 3}
-    own = {"row": rows, "rows": 10_000 // each, "test_ws_psnr": best, "minimal": minimal, "knee": 1, "steps": steps}
+    possible, by_test = minimal | {"0.1": 2}, minimal | {"0.1": 3}
+    own = {
+        "row": rows,
+        "possible": possible,
+        "by_test": by_test,
+        "rows": 10_000 // each,
+        "test_ws_psnr": best,
+        "minimal": minimal,
+        "knee": 1,
+        "steps": steps,
+    }
     return own | {"validation": ["a", "b", "c"], "seconds": 10.0, "cpu_seconds": 5.0}
 
 
@@ -51,6 +61,7 @@ def test_a_row_for_each_search_with_its_smallest_models():
     text = markdown(table(run_set(runs())))
     row = next(line for line in text.splitlines() if line.startswith("| OmniGS"))
     assert [cell.strip("* ") for cell in row.split("|")][2:8] == ["8000", *("8000", "4000", "2000", "2000", "1000")][:6]
+    assert [cell.strip("* ") for cell in row.split("|")][8:10] == ["2000", "1000"], "interval, and by test views"
     assert "| 0.40 |" in row and "ODGS" not in text
     assert table(run_set(runs()[2:])).blocks == () and charts(run_set(runs()[2:])) == []
 

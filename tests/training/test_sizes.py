@@ -39,6 +39,13 @@ def test_a_pixel_is_the_mean_of_the_four_that_it_covers():
     assert mask is not None and torch.equal(mask, torch.ones(4, 8).index_fill(1, torch.arange(2), 0))
 
 
+def test_hidden_pixels_have_no_part_in_small_ones():
+    view = made(12, 6)  # three columns are hidden
+    white = replace(view, load_pixels=lambda: torch.where(view.mask()[..., None] > 0, view.load_pixels(), 255))
+    assert torch.equal(halved(view).mask()[0, :3], torch.tensor([0.0, 0.5, 1.0]))
+    assert torch.equal(halved(view).load_pixels()[:, 1:], halved(white).load_pixels()[:, 1:])
+
+
 def test_a_photograph_at_half_the_size_shows_what_is_rendered_at_half_the_size():
     view = View("a", torch.eye(4, dtype=torch.float64), 256, 128)
     image = render(truth(), view, RenderOptions()).image
