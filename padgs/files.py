@@ -119,6 +119,17 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.close(folder)
 
 
+def read_regular(path: Path) -> bytes:
+    """Return the content of a regular file; reading a pipe or a device may never end.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    return path.read_bytes()
+
+
 class ImageError(OSError):
     """An image that is not read. The message names the file, the rule and the way out."""
 

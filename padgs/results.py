@@ -15,7 +15,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from padgs.files import write_atomically
+from padgs.files import read_regular, write_atomically
 
 STATUSES = {
     "ok": "trained to the end and evaluated",
@@ -139,7 +139,7 @@ SMALLEST_PICTURE = "smallest.png"  # ground truth | full model | smallest model 
 def log_lines(run_folder: Path) -> Iterator[dict[str, Any]]:
     """Yield the complete lines of a run's log, each with its `iteration`; a missing log has no lines."""
     try:
-        lines = (run_folder / LOG_NAME).read_bytes().splitlines()
+        lines = read_regular(run_folder / LOG_NAME).splitlines()
     except OSError:
         return
     for line in lines:
@@ -207,7 +207,7 @@ def file_content(path: Path) -> bytes:
         ResultError: it cannot be read.
     """
     try:
-        return path.read_bytes()
+        return read_regular(path)
     except OSError as error:
         raise ResultError(f"cannot read {path}: {error.strerror}") from error
 

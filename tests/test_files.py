@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from padgs.files import DRAFT, atomic_path, draft_of
+from padgs import results
+from padgs.files import DRAFT, atomic_path, draft_of, read_regular
+from padgs.runs import checkpoint
 
 KILLED = """
 import os, signal, sys
@@ -54,3 +56,16 @@ def test_long_names_leave_room_for_the_draft(tmp_path: Path) -> None:
     with atomic_path(path) as draft:
         draft.write_text("")
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["result.json", "log.jsonl", "checkpoint/state.json"])
+def test_pipes_in_place_of_files_of_a_run_are_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "checkpoint").mkdir()
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(OSError, match="no regular file"):
+        read_regular(tmp_path / name)
+    assert list(results.log_lines(tmp_path)) == []
+    with pytest.raises(results.ResultError, match=r"cannot read .*result.json: (it is no regular|No such) file"):
+        results.read(tmp_path / "result.json")
+    with pytest.raises(checkpoint.CheckpointError, match=r"cannot read .*state.json: (it is no regular|No such) file"):
+        checkpoint.load(tmp_path / "checkpoint")

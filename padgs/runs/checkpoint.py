@@ -19,7 +19,7 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from padgs.files import write_atomically
+from padgs.files import read_regular, write_atomically
 from padgs.training.health import is_out_of_memory
 from padgs.training.model import State
 
@@ -82,7 +82,7 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
             raise CheckpointError(f"{folder} is of a run with another {what}; put the right one there, or {WAY_OUT}")
     path = folder / manifest["tensors"]
     try:
-        content = path.read_bytes()
+        content = read_regular(path)
     except OSError as error:
         raise CheckpointError(f"cannot read {error.filename}: {error.strerror}; {WAY_OUT}") from error
     if len(content) != manifest["bytes"]:
@@ -118,7 +118,7 @@ def _refuse_impossible(values: Mapping[str, Any]) -> None:
 def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
-        known = json.loads(path.read_bytes())
+        known = json.loads(read_regular(path))
         if known["format"] != FORMAT:
             raise CheckpointError(f"{path} has format {known['format']}, this program reads {FORMAT}; {WAY_OUT}")
         kinds = {"tensors": str, "bytes": int, "sha256": str, "values": dict, "run": dict, "manifest_sha256": str}
