@@ -23,8 +23,8 @@ NOTES = (
     "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
     "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the test views, "
     "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
-    "At least: the smallest model that is not known to lose more, with 95 % confidence, where the interval of the minimal "
-    "count begins. By test views: the smallest model that loses no more on the test views.",
+    "At least: the smallest model that is not known to lose more, with 95 % confidence; the interval of the minimal "
+    "count begins there. By test views: the smallest model that loses no more on the test views.",
     "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
     "curves share.",
 )

@@ -80,8 +80,12 @@ def band_shares(view: View) -> dict[str, float]:
 
 def differences(candidate: Scores, control: Scores, metric: str) -> dict[str, float]:
     """Return candidate minus control for each view that both have the metric of; 0 where both are perfect."""
-    pairs = {name: (candidate.views[name].get(metric), view.get(metric)) for name, view in control.views.items()}
-    return {name: 0.0 if new == old else new - old for name, (new, old) in pairs.items() if None not in (new, old)}
+    found = {}
+    for name, view in control.views.items():
+        new, old = candidate.views[name].get(metric), view.get(metric)
+        if new is not None and old is not None:
+            found[name] = 0.0 if new == old else new - old
+    return found
 
 
 def lower_bound(changes: Sequence[float]) -> float:
@@ -118,8 +122,8 @@ def smallest_possible(candidates: Sequence[Candidate], epsilon: float) -> Candid
 
 def smallest_by_test(candidates: Sequence[Candidate], epsilon: float) -> Candidate | None:
     """Return the smallest candidate whose mean loss on the test views is at most `epsilon` dB; None without them."""
-    control = candidates[0].test_ws_psnr
-    good = (c for c in candidates if None not in (control, c.test_ws_psnr) and control - c.test_ws_psnr <= epsilon)
+    measured = [(c, c.test_ws_psnr) for c in candidates if c.test_ws_psnr is not None]
+    good = (candidate for candidate, quality in measured if measured[0][1] - quality <= epsilon)
     return min(good, key=lambda candidate: candidate.rows, default=None)
 
 
