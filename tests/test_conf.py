@@ -122,6 +122,13 @@ def test_what_the_command_line_sweeps_multiplies_with_the_file_or_replaces_it():
     ]
 
 
+def test_a_sweep_of_too_many_jobs_is_refused():
+    with composing() as loader:
+        for settings in (["seed=range(1,1e9)"], ["seed=range(0,101)", "train.iterations=range(1,101)"]):
+            with pytest.raises(ValueError, match="more than 10000 jobs"):
+                expand({}, settings, loader)
+
+
 def test_the_tables_of_the_paper_are_all_of_its_scenes_times_all_of_its_methods():
     for name, known in (("table1_360roam", "roam360"), ("table2_ricoh360", "ricoh360")):
         pairs = [dict(setting.split("=") for setting in job) for job in expanded(f"+experiment={name}")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import math
 import os
 import re
 import shlex
@@ -14,6 +15,7 @@ from typing import Any
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
 
 from padgs.checks import install_command, unknown
 
@@ -26,6 +28,7 @@ PLUGINS = {  # choice of conf/launcher -> module of its plugin, extra of pyproje
     "submitit": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
     "ray": ("hydra_plugins.hydra_ray_launcher", "ray"),
 }
+MOST_JOBS = 10_000
 # Keys that name files, and their values; values in Hydra's grammar: nothing, null, quotes, dictionaries, calls;
 # one name of a list.
 FILES = re.compile(r"(\+*(?:data\.(?:path|images|points|mask)|run\.folder|init)=)(.*)", re.DOTALL)
@@ -112,6 +115,10 @@ def problem(arguments: Sequence[str]) -> str | None:
     'photographs is no setting: these are KEY=VALUE, e.g. data.path=photographs; see padgs-run --help'
     >>> problem(["seed=1", "-m", "method=padgs", "++seed=2"])
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
+    >>> problem(["seed=[1"]).partition(";")[0]
+    "seed=[1 cannot be read (no viable alternative at input '[1')"
+    >>> problem(["method=[a]"])
+    'method=[a]: method is a group of settings, chosen by name; see padgs-run --help'
     >>> problem(["+sweep=tau,seeds"])
     '+sweep=tau,seeds: one sweep at a time, because each names what it sweeps'
     >>> problem(["+scene=roam360_bar", "launcher=slurm"])
@@ -137,8 +144,15 @@ def problem(arguments: Sequence[str]) -> str | None:
             return f"{key} is set twice, by {settings[key]} and {argument}; keep one of them"
         if key in ("experiment", "sweep") and ("," in value or "(" in value):
             return f"{argument}: one {key} at a time, because each names what it sweeps"
-        if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*", value, re.IGNORECASE):
+        if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*|[\[{].*", value, re.IGNORECASE):
             return f"{argument}: {key} is a group of settings, chosen by name; {HELP}"
+        try:
+            OverridesParser.create().parse_override(quoted([argument])[0])
+        except HydraException as error:
+            reason = re.split(r"\n| expecting ", str(error))[0]
+            return (
+                f"{argument} cannot be read ({reason}); a value with special characters needs quotes: {key}='\"...\"'"
+            )
         settings[key] = argument
     launcher = settings.get("launcher", "=none").partition("=")[2]
     if launcher != "none" and not is_multirun(arguments) and SHOW not in arguments:
@@ -173,13 +187,18 @@ def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLo
         params: `hydra.sweeper.params`, key -> values in the grammar of the command line.
         arguments: of the command line; they replace the same keys of `params`.
         loader: lists the choices of groups, for `glob(...)`.
-    """
 
+    Raises:
+        ValueError: there are more than `MOST_JOBS` jobs.
+    """
     swept = lenient([f"{key}={values}" for key, values in params.items() if values is not None])
     choices: dict[str, list[str]] = {}
     for override in OverridesParser.create(config_loader=loader).parse_overrides([*swept, *arguments]):
         key = override.get_key_element()
         values = override.sweep_string_iterator() if override.is_sweep_override() else [None]
-        texts = [override.get_value_element_as_str() if value is None else value for value in values]
+        first = list(itertools.islice(values, MOST_JOBS + 1))  # range(1,1e9) would take all memory
+        texts = [override.get_value_element_as_str() if value is None else value for value in first]
         choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in texts]
+    if math.prod(map(len, choices.values())) > MOST_JOBS:
+        raise ValueError(f"the sweep has more than {MOST_JOBS} jobs; sweep fewer values, or use several commands")
     return [list(job) for job in itertools.product(*choices.values())]
