@@ -52,12 +52,12 @@ def cache(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def start(tmp_path, cache, root):
-    """Start `padgs-run` in an empty folder, in a process group of its own."""
+    """Start `padgs-run`, or another program, in an empty folder, in a process group of its own."""
 
-    def started(*arguments: str) -> subprocess.Popen:
+    def started(*arguments: str, module: str = "padgs.multirun.run") -> subprocess.Popen:
         environment = os.environ | {"PYTHONPATH": str(root), "PADGS_CACHE": str(cache), "COLUMNS": "200"}
         environment.pop("PADGS_ROOT", None)
-        command = [sys.executable, "-W", "ignore", "-m", "padgs.multirun.run", *arguments]
+        command = [sys.executable, "-W", "ignore", "-m", module, *arguments]
         pipe = subprocess.PIPE
         return subprocess.Popen(
             command, cwd=tmp_path, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
@@ -99,6 +99,11 @@ def exit_on_errors() -> Iterator[None]:
     except MissingConfigException as error:
         group, _, name = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
         complain(unknown(group, name, error.options or ()))
+        sys.exit(1)
+    except OverrideParseException as error:
+        key, _, value = error.override.lstrip("+").partition("=")
+        rule = "values with spaces or any of ,;:{}[]()'\" need quotes"
+        complain(f"{key}={value} cannot be read: {rule}, e.g. padgs-run '{key}=\"VALUE\"'")
         sys.exit(1)
     except HydraException as error:
         complain("\n".join(map(str, filter(None, (error, error.__cause__)))))

@@ -4,9 +4,13 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 from support.tiny_run import SMALLEST, finish
+
+from padgs import results
 
 TINY = [*SMALLEST, "train.iterations=20", "run.probe_every=50", "tracking=none", "method=omnigs"]
 # Sends itself signals: PHASE=NUMBER,NUMBER ... are the first arguments, up to --. Phases are modules and functions.
@@ -87,6 +91,42 @@ def test_signals_without_a_meaning_are_ignored_and_sigusr1_ends_training_early(b
 def test_nohup_keeps_a_run_alive(begin):
     code, _, error = finish(begin(TINY, "nohup", load=(signal.SIGHUP,), train=(signal.SIGHUP,)))
     assert code == 0, error
+
+
+@pytest.mark.slow
+def test_workers_of_a_multirun_write_checkpoints_and_ignore_other_signals(start, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    given = [text for text in TINY if not text.startswith("train.iterations")]
+    process = start("-m", *given, "seed=0,1", "launcher=local", "run.jobs=2", "train.iterations=5000")
+    wait_for_files(tmp_path, "runs/*/log.jsonl", 2, process)
+    for number in (signal.SIGUSR2, signal.SIGHUP):
+        process.send_signal(number)
+    code, out, error = finish(process)
+    assert code == 128 + signal.SIGHUP and "2 stopped" in out and "running jobs wrote their checkpoints" in error
+    assert len([*tmp_path.glob("runs/*/checkpoint/state.json")]) == 2
+
+
+@pytest.mark.slow
+def test_a_search_keeps_its_candidates_and_sigusr1_cuts_none_short(start, tmp_path):
+    given = [text for text in TINY if not text.startswith(("train.iterations", "data.generator.train_views"))]
+    code, _, error = finish(start(*given, "train.iterations=400", "data.generator.train_views=12"))
+    assert code == 0, error
+    (run,) = (path.parent for path in tmp_path.glob("runs/*/result.json"))
+    process = start("smallest", str(run), module="padgs.cli.app")
+    wait_for_files(run, "smallest/*/log.jsonl", 1, process)
+    process.send_signal(signal.SIGUSR1)
+    wait_for_files(run, "smallest/*/result.json", 1, process)
+    process.send_signal(signal.SIGHUP)
+    code, _, error = finish(process)
+    assert code in (0, 128 + signal.SIGHUP) and "Traceback" not in error
+    assert not [path for path in run.glob("smallest/*/result.json") if results.read(path).ended]
+
+
+def wait_for_files(folder: Path, pattern: str, count: int, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 200
+    while len([*folder.glob(pattern)]) < count:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 CUT = """
