@@ -50,7 +50,7 @@ def _xmp(image: Image.Image) -> str:
     return packet if isinstance(packet, str) else packet.decode("utf-8", errors="replace").replace("\0", "")
 
 
-def _stated(xmp: str, name: str) -> str | None:
+def stated(xmp: str, name: str) -> str | None:
     """Return the value of a property, written as an attribute or as an element."""
     found = re.search(rf"""[:<]{name}\s*(?:=\s*["']([^"']*)["']|>([^<]*)<)""", xmp)
     return None if found is None else (found[1] if found[1] is not None else found[2]).strip()
@@ -70,8 +70,11 @@ def refuse_rotated(image: Image.Image, path: object) -> None:
         DataError: the orientation is not upright.
     """
     has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
-    stated = {"EXIF": image.getexif().get(_ORIENTATION) if has_exif else 1, "XMP": _stated(_xmp(image), "Orientation")}
-    for source, orientation in stated.items():
+    orientations = {
+        "EXIF": image.getexif().get(_ORIENTATION) if has_exif else 1,
+        "XMP": stated(_xmp(image), "Orientation"),
+    }
+    for source, orientation in orientations.items():
         if str(orientation) not in ("None", "0", "1"):
             raise DataError(
                 f"{path} carries {source} orientation {orientation}: its pixels are stored rotated, and it is unknown "
@@ -94,7 +97,7 @@ def refuse_several_pictures(image: Image.Image, path: object) -> None:
             f"{path} holds {count} pictures (an animation, pages or a stereo pair); save the one that is meant as a "
             "file of its own (`magick 'FILE[0]' ONE.png`)"
         )
-    mode = _stated(_xmp(image), "StereoMode")
+    mode = stated(_xmp(image), "StereoMode")
     if mode is not None and mode.casefold() not in ("", "mono", "none"):
         raise DataError(f"{path} says that it is stereo ({mode}): {_STEREO}, or {_REMOVE}")
 
@@ -106,13 +109,13 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
         DataError: another projection, or numbers that contradict each other.
     """
     xmp = _xmp(image)
-    projection = _stated(xmp, "ProjectionType")
+    projection = stated(xmp, "ProjectionType")
     if projection is not None and projection.casefold() != "equirectangular":
         raise DataError(
             f"{path} says that its projection is {projection!r}, not equirectangular; convert it with the program that "
             f"made it, or {_REMOVE}"
         )
-    texts = {name: _stated(xmp, name) for name in _CROP_PROPERTIES}
+    texts = {name: stated(xmp, name) for name in _CROP_PROPERTIES}
     if all(text is None for text in texts.values()):
         return None
     said = ", ".join(f"{name} {text}" for name, text in texts.items() if text is not None)
@@ -140,7 +143,7 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
 def tilt_of(image: Image.Image) -> str | None:
     """Return the stated pitch and roll of the camera; None if it was upright."""
     xmp = _xmp(image)
-    angles = {name: _stated(xmp, f"Pose{name}Degrees") for name in ("Pitch", "Roll")}
+    angles = {name: stated(xmp, f"Pose{name}Degrees") for name in ("Pitch", "Roll")}
     found = [f"{name.lower()} {text}" for name, text in angles.items() if text and text.strip("+-0.") != ""]
     return " and ".join(found) or None
 

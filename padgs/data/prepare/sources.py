@@ -18,6 +18,7 @@ from PIL import Image
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, DataError, Frame, listed
 from padgs.data.check import OVERLAY
+from padgs.data.image_metadata import stated
 from padgs.data.images import (
     EXTENSIONS,
     ImageFile,
@@ -43,6 +44,9 @@ _PROJECTIONS = (
     "rectilinear",
     "fisheye",
 )
+_BOXES = (b"ftyp", b"free", b"skip", b"wide", b"mdat", b"uuid", b"pdin", b"meta", b"moof", b"sidx", b"styp")
+_MAX_MOOV = 1 << 28  # bytes
+_EYES_BY_NAME = {None: (1, 1), "mono": (1, 1), "top-bottom": (2, 1), "left-right": (1, 2)}
 _ONE_EYE = {0: (1, 1), 1: (1, 2), 2: (2, 1)}  # FFmpeg's stereo layout -> views one above the other, and side by side
 
 
@@ -84,13 +88,14 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
                 raise DataError(f"{video} holds no video stream; give a stitched 360-degree video")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
+            eyes = _eyes_by_xml(video)
             rate = float(stream.average_rate or 30)
             total = stream.frames or round(rate * float((container.duration or 0) / av.time_base))
             best, best_sharpness, interval, start = None, -1.0, 0, None
             for index, frame in enumerate(container.decode(stream)):
                 time = index / rate if frame.time is None else frame.time
                 start = time if start is None else start
-                pixels = _panorama_of(frame, video)
+                pixels = _panorama_of(frame, video, eyes)
                 if index == 0:  # before an hour of decoding
                     refuse_other_shapes(pixels.shape[1], pixels.shape[0], video)
                     refuse_dual_fisheye(pixels, video)
@@ -112,7 +117,39 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
 
 
-def _panorama_of(frame: Any, video: Path) -> NDArray[np.uint8]:
+def _eyes_by_xml(video: Path) -> tuple[int, int]:
+    """Return the views one above the other and side by side by the XML of an MP4 file, which FFmpeg reads in part.
+
+    Raises:
+        DataError: it says that the panoramas are in another projection, or cropped.
+    """
+    xml = ""
+    with open(video, "rb") as file:
+        while len(head := file.read(8)) == 8:
+            size = int.from_bytes(head[:4], "big") - 8
+            if size == -7:  # 64 bits follow
+                size = int.from_bytes(file.read(8), "big") - 16
+            if head[4:] == b"moov":
+                content = file.read(max(0, min(size, _MAX_MOOV)))
+                start = content.find(b"SphericalVideo")
+                xml = content[start : content.find(b"SphericalVideo>", start + 1)].decode("utf-8", errors="replace")
+                break
+            if size < 0 or head[4:] not in _BOXES:
+                break
+            file.seek(size, 1)
+    if (kind := stated(xml, "ProjectionType")) not in (None, "equirectangular"):
+        raise DataError(f"{video} says that its projection is {kind}, not equirectangular; convert it")
+    for side in ("Width", "Height"):
+        full, part = stated(xml, f"FullPano{side}Pixels"), stated(xml, f"CroppedAreaImage{side}Pixels")
+        if full != part:
+            raise DataError(f"{video} says that it shows {part} of {full} pixels of its panoramas; export all of them")
+    mode = stated(xml, "StereoMode")
+    if mode not in _EYES_BY_NAME:
+        raise DataError(f"{video} says that it is stereo of a kind that is not read ({mode}); export one eye")
+    return _EYES_BY_NAME[mode]
+
+
+def _panorama_of(frame: Any, video: Path, eyes: tuple[int, int] = (1, 1)) -> NDArray[np.uint8]:
     """Return the pixels of a frame, turned upright and of one eye, as the video says.
 
     Raises:
@@ -135,8 +172,8 @@ def _panorama_of(frame: Any, video: Path) -> NDArray[np.uint8]:
         layout = int(said["STEREO3D"][0])
         if layout not in _ONE_EYE:
             raise DataError(f"{video} says that it is stereo of a kind that is not read ({layout}); export one eye")
-        down, across = _ONE_EYE[layout]
-        pixels = pixels[: len(pixels) // down, : pixels.shape[1] // across]
+        eyes = _ONE_EYE[layout]
+    pixels = pixels[: len(pixels) // eyes[0], : pixels.shape[1] // eyes[1]]
     if "DISPLAYMATRIX" in said:
         (a, b), (c, d) = said["DISPLAYMATRIX"].reshape(3, 3)[:2, :2].astype(float)
         quarters = math.degrees(math.atan2(c, a)) / 90

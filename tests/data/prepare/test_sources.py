@@ -185,6 +185,40 @@ def test_frames_are_turned_and_cut_as_the_video_says(name, store, stated, tmp_pa
     assert np.abs(np.asarray(Image.open(tmp_path / "frame_00001.jpg")).astype(int) - pixels).mean() < 2
 
 
+def add_spherical_xml(path, **properties):
+    """Add the metadata of Spherical Video V1 to the track of an MP4 file whose index is at its end."""
+    content = "".join(f"<GSpherical:{name}>{value}</GSpherical:{name}>" for name, value in properties.items())
+    xml = f'<?xml version="1.0"?><rdf:SphericalVideo>{content}</rdf:SphericalVideo>'.encode()
+    data = path.read_bytes()
+    moov, trak = data.index(b"moov") - 4, data.index(b"trak") - 4
+    box = (len(xml) + 24).to_bytes(4, "big") + b"uuid" + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + xml
+    end = trak + int.from_bytes(data[trak : trak + 4], "big")
+    data = data[:end] + box + data[end:]
+    for place in (moov, trak):
+        size = int.from_bytes(data[place : place + 4], "big") + len(box)
+        data = data[:place] + size.to_bytes(4, "big") + data[place + 4 :]
+    path.write_bytes(data)
+
+
+def test_the_xml_of_an_mp4_file_is_read(tmp_path):
+    path, pixels = tmp_path / "a.mp4", np.full((64, 128, 3), 90, np.uint8)
+    for mode, stored in (("top-bottom", np.tile(pixels, (2, 1, 1))), ("left-right", np.tile(pixels, (1, 2, 1)))):
+        write(path, 3 * [stored])
+        add_spherical_xml(path, ProjectionType="equirectangular", StereoMode=mode)
+        extract_frames(path, tmp_path, 2.0)
+        assert np.asarray(Image.open(tmp_path / "frame_00001.jpg")).shape == (64, 128, 3)
+    refused = (
+        ({"ProjectionType": "cubemap"}, "its projection is cubemap"),
+        ({"StereoMode": "stereo-custom"}, "stereo of a kind that is not read"),
+        ({"FullPanoWidthPixels": 256, "CroppedAreaImageWidthPixels": 128}, "128 of 256 pixels of its panoramas"),
+    )
+    for properties, message in refused:
+        write(path, 3 * [pixels])
+        add_spherical_xml(path, **properties)
+        with pytest.raises(DataError, match=message):
+            extract_frames(path, tmp_path, 2.0)
+
+
 class Side(bytes):
     type = SimpleNamespace(name="")
 
