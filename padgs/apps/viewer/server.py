@@ -5,6 +5,7 @@ Imports no torch, so that browsers can load the page while torch and the runs ar
 
 from __future__ import annotations
 
+import errno
 import secrets
 import socket
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from padgs.checks import install_command
 
 LOCAL, PORT = "127.0.0.1", 8080
 ALL_INTERFACES = "0.0.0.0"
+PORTS_TRIED = 1000
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
         ValueError: the extra `view` is not installed.
         OSError: the address cannot be used.
     """
-    viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost")
+    viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
+    port = free_port(host, port)
     with redirect_stdout(None), guard(token, is_local=local) as guarded:  # viser prints addresses even if not verbose
         server = viser.ViserServer(host=host, port=port, label="padgs", verbose=False)
     if not guarded:
@@ -50,12 +53,38 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
     server.gui.configure_theme(dark_mode=True, show_share_button=False)  # sharing uses an external server
     for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
-    name = "localhost" if local else network_address() if host == ALL_INTERFACES else host
+    name = f"[{host}]" if ":" in host else "localhost" if local else host
+    if host == ALL_INTERFACES:
+        name = network_address()
     try:
         yield Server(f"http://{name}:{server.get_port()}/?token={token}", server, local)
     finally:
         with redirect_stdout(None):
             server.stop()
+
+
+def free_port(host: str, first: int) -> int:
+    """Return the first free port from `first` on; viser would wait for ever for one that cannot be had.
+
+    Raises:
+        OSError: the host is no address of this machine, or no port is free.
+    """
+    reason = f"the ports from {first} on are taken"
+    for port in range(first, min(first + PORTS_TRIED, 65536)):
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+            return port
+        except (OSError, UnicodeError) as error:
+            if getattr(error, "errno", None) not in (errno.EADDRINUSE, errno.EACCES):
+                reason = getattr(error, "strerror", None) or str(error)
+                break
+    raise OSError(
+        f"cannot serve at {host}: {reason}; give --host an address of this machine or {ALL_INTERFACES}, and --port a "
+        "free port"
+    )
 
 
 def network_address() -> str:

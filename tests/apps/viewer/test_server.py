@@ -1,5 +1,6 @@
 """Pages in a real browser, and what may go wrong before there is one."""
 
+import socket
 import sys
 import time
 from urllib.request import urlopen
@@ -49,6 +50,22 @@ def test_network_pages_have_a_network_address():
     with start_server(host="0.0.0.0", port=8410) as server:
         assert not server.is_local and "0.0.0.0" not in server.address
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
+
+
+@WITH_VISER
+@pytest.mark.parametrize("host", ["999.9.9.9", "8.8.8.8", "[::1]", "x" * 300])
+def test_hosts_that_cannot_be_served_are_refused(host):
+    with pytest.raises(OSError, match="cannot serve at .* give --host an address of this machine"):  # noqa: SIM117
+        with start_server(host=host):
+            raise AssertionError("it was started")
+
+
+@WITH_VISER
+def test_the_next_free_port_is_used():
+    with socket.create_server(("127.0.0.1", 65534)), start_server(port=65534) as server:
+        assert server.viser.get_port() == 65535
+        with pytest.raises(OSError, match="the ports from 65534 on are taken"), start_server(port=65534):
+            raise AssertionError("it was started")
 
 
 @WITH_VISER
