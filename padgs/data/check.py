@@ -27,6 +27,7 @@ MAX_WIDTH = 2048  # of the overlay
 SMALL = 256  # width at which colours are compared
 MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
 MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
+MIN_POINTS = 30  # whose colours are compared
 MIN_CORRELATION = 0.3  # of the colours of points and images that agree
 MAX_HIDDEN = 0.5  # share of an image that a sound mask hides at most: tripod, photographer, sky
 LEAK_DISTANCE = 0.01  # of the median depth: a test view nearer to a training view tests memory
@@ -200,7 +201,8 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
             fits = track_fit(poses, capture.cloud.points, tracks, width, height, conventions)
             if max(fits) >= -limit:
                 report.suggestion = conventions[fits.index(max(fits))].words
-    compared = report.coloured and scene.point_colors.float().std(0).max() >= 1  # one colour correlates with nothing
+    # A few points, or points of one colour, correlate with anything or nothing.
+    compared = report.coloured and report.points >= MIN_POINTS and scene.point_colors.float().std(0).max() >= 1
     if not (compared or report.observations):
         report.notes.append("poses are not compared with images: there are neither observations nor coloured points")
     if any("random points" in note for note in scene.notes):

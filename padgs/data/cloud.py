@@ -35,14 +35,14 @@ def read_ply(path: Path) -> Cloud:
 
     if not {"x", "y", "z"} <= stored.keys():
         raise DataError(f"{path} has the properties {', '.join(sorted(names))}; a point cloud needs x, y and z")
-    groups = [[prefix + name for name in group] for prefix in PREFIXES for group in CHANNELS]
+    groups = [[prefix + name for name in group] for prefix in PREFIXES for group in (*CHANNELS, SH_CHANNELS)]
     channels = next((group for group in groups if set(group) <= stored.keys()), None)
     packed = next((name for name in ("rgb", "rgba") if name in stored), None)
     colors = None
-    if channels is not None:
+    if channels and channels[0].endswith(SH_CHANNELS[0]):
+        colors = color_bytes((0.5 + SH_C0 * columns(*channels)).clip(0, 1), str(path))
+    elif channels:
         colors = color_bytes(columns(*channels), str(path))
-    elif set(SH_CHANNELS) <= stored.keys():
-        colors = color_bytes((0.5 + SH_C0 * columns(*SH_CHANNELS)).clip(0, 1), str(path))
     elif packed and (bits := columns(packed)).itemsize == 4:  # PCL: 0xAARRGGBB, stored as an integer or a float
         colors = color_bytes((bits.view(np.uint32) >> np.array([16, 8, 0], np.uint32)).astype(np.uint8), str(path))
     return Cloud(torch.from_numpy(columns("x", "y", "z").astype(np.float64)), colors)

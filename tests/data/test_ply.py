@@ -114,8 +114,10 @@ def test_names_of_colours(names: str, tmp_path: Path) -> None:
 
 
 def test_colours_of_gaussians_and_packed_colours(tmp_path: Path) -> None:
-    columns = {f"f_dc_{i}": ("f4", [(value / 255 - 0.5) / 0.28209479, 9]) for i, value in enumerate((10, 20, 30))}
-    assert read_ply(_write(tmp_path / "a.ply", columns)).colors.tolist() == [[10, 20, 30], [255] * 3]  # type: ignore
+    for prefix in ("", "scalar_"):  # CloudCompare
+        values = [[(value / 255 - 0.5) / 0.28209479, 9] for value in (10, 20, 30)]
+        columns = {f"{prefix}f_dc_{i}": ("f4", column) for i, column in enumerate(values)}
+        assert read_ply(_write(tmp_path / "a.ply", columns)).colors.tolist() == [[10, 20, 30], [255] * 3]  # type: ignore
     packed = np.array([0x0A141E, 0xFF5A5A5A], np.uint32)
     for name, values in (("rgb", packed.view(np.float32)), ("rgba", packed)):
         path = _write(tmp_path / "a.ply", {name: ("f4" if name == "rgb" else "u4", list(values))})

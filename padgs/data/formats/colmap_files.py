@@ -152,7 +152,7 @@ def read_frames(model: Path) -> tuple[list[str], dict[int, NDArray[np.float64]]]
 
     def matrix(pose: Sequence[float]) -> NDArray[np.float64]:
         found = np.eye(4)
-        if np.isfinite(pose).all() and any(pose[:4]):
+        if np.isfinite(pose).all() and np.linalg.norm(pose[:4]) > 0.5:
             found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), pose[4:]
         return found
 
@@ -184,7 +184,8 @@ def read_frames(model: Path) -> tuple[list[str], dict[int, NDArray[np.float64]]]
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines of a text file that are neither empty nor comments, with their numbers."""
-    for number, line in enumerate(read_lines(file, errors="surrogateescape"), 1):
+    errors = "surrogateescape" if file.stem == "images" else "replace"  # names are refused later, with advice
+    for number, line in enumerate(read_lines(file, errors), 1):
         if line.strip() and not line.startswith("#"):
             yield number, line.strip()
 

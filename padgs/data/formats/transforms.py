@@ -29,7 +29,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     """
     file = file_in(path, FILE)
     folder = file.parent
-    if file.is_file():
+    if file.exists():
         metas = {"": read_json(file)}
     else:
         metas = {side: read_json(folder / name) for side, name in SIDES.items() if (folder / name).is_file()}
