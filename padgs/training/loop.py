@@ -83,8 +83,7 @@ class Trainer:
     def records(self) -> Iterator[Record]:
         """Train to the end of the budget or to `Budget.max_seconds`, yielding a record after each iteration.
 
-        Raises:
-            Failure: nan (a loss, gradient or parameter is not finite), oom, collapsed, or a finding of the `Monitor`.
+        It raises a `Failure`: not finite (nan), out of memory (oom), nothing left to draw, or found by the `Monitor`.
         """
         budget, limit = self._budget, self._budget.max_seconds
         while self.step < budget.iterations and (limit is None or self.seconds < limit):

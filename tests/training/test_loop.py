@@ -277,15 +277,19 @@ def test_out_of_memory_is_a_status_and_other_errors_are_not():
     assert not isinstance(caught.value, Failure)
 
 
-def test_wrong_options_are_named():
-    with pytest.raises(ValueError, match="unknown weight 'sphere'; known: solid_angle, uniform, end_rows"):
-        TrainOptions(weight="sphere")
-    with pytest.raises(ValueError, match="unknown normalisation 'sum'; known: mean, channel_sum"):
-        TrainOptions(normalisation="sum")
-    with pytest.raises(ValueError, match=r"lambda_l1 is 1\.2"):
-        TrainOptions(lambda_l1=1.2)
-    with pytest.raises(ValueError, match="check_every is 0"):
-        TrainOptions(check_every=0)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"weight": "sphere"}, "unknown weight 'sphere'; known: solid_angle, uniform, end_rows"),
+        ({"normalisation": "sum"}, "unknown normalisation 'sum'; known: mean, channel_sum"),
+        ({"lambda_l1": 1.2}, r"lambda_l1 is 1\.2"),
+        ({"check_every": 0}, "check_every is 0"),
+        ({"hold_out": -1}, "hold_out is -1; it must be the number of a fold"),
+    ],
+)
+def test_wrong_options_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrainOptions(**options)
 
 
 TICK = 1 / 128  # seconds; sums of it are exact

@@ -5,20 +5,11 @@ import pytest
 from padgs.training.schedule import FASTEST, PUBLISHED_ITERATIONS, Constant, LogLinear, Pace, scaled
 
 
-def test_log_linear_falls_by_equal_factors():
+def test_log_linear_falls_by_equal_factors_and_stays_at_its_end():
     decay = LogLinear(1e-2, 1e-4, steps=30_000)
-    assert decay(0) == pytest.approx(1e-2)
-    assert decay(15_000) == pytest.approx(1e-3)
-    assert decay(30_000) == pytest.approx(1e-4)
+    assert [decay(i) for i in (0, 15_000, 30_000, 10**6)] == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
     factors = [decay(i + 1000) / decay(i) for i in range(0, 30_000, 1000)]
     assert factors == pytest.approx([factors[0]] * 30)
-
-
-def test_log_linear_stays_at_its_end():
-    assert LogLinear(1e-2, 1e-4, steps=10)(1_000_000) == pytest.approx(1e-4)
-
-
-def test_constant_is_constant():
     assert {Constant(0.3)(i) for i in (0, 1, 10**6)} == {0.3}
 
 
