@@ -16,7 +16,8 @@ def lookup(registry: Mapping[str, str], name: str, kind: str) -> Any:
         kind: what the registry holds, for the error message ("backend", "method", ...).
 
     Raises:
-        ValueError: `name` is not registered; the message lists the names that are.
+        ValueError: `name` is not registered (the message lists the names that are), or is of another package that
+            fails, or ends the program, when it is imported.
 
     >>> lookup({"sqrt": "math:sqrt"}, "sqrt", "function")(9.0)
     3.0
@@ -24,4 +25,10 @@ def lookup(registry: Mapping[str, str], name: str, kind: str) -> Any:
     if name not in registry:
         raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(sorted(registry))}")
     module, _, attribute = registry[name].partition(":")
-    return getattr(import_module(module), attribute)
+    try:
+        return getattr(import_module(module), attribute)
+    except (Exception, SystemExit) as error:
+        if module.partition(".")[0] == "padgs":
+            raise
+        why = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{kind} {name} cannot be used: {registry[name]} of another package fails ({why})") from error

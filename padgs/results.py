@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from padgs.files import read_regular, write_atomically
@@ -146,7 +146,7 @@ def log_lines(run_folder: Path) -> Iterator[dict[str, Any]]:
         try:
             entry = json.loads(line)
             entry["iteration"] = int(entry["iteration"])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
         yield entry
 
@@ -170,6 +170,7 @@ def picture_name(view: str) -> str:
 
 
 SCHEMA = 2
+LONGEST_NAME = 255  # letters, as of a file
 FILE_NAME = "result.json"
 CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stress", "train"}  # sections of settings
 # Names that are safe in a path and a command line; `@` separates an experiment from its scale.
@@ -222,15 +223,22 @@ def parsed(content: bytes, where: str) -> dict[str, Any]:
     """Parse the JSON of a document; `where` names it in errors.
 
     Raises:
-        ResultError: it is truncated or no result.
+        ResultError: it is truncated or no result, or has numbers or texts that no result has.
     """
     try:
-        document = json.loads(content)
+        document = json.loads(content, parse_constant=_int, parse_int=_int)
+        json.dumps(document, ensure_ascii=False, allow_nan=False).encode()  # not possible for lone surrogates
     except (ValueError, RecursionError) as error:
         raise ResultError(f"{where} is not JSON ({error}); delete it and run again") from error
     if not isinstance(document, dict) or "schema" not in document:
         raise ResultError(f"{where} is not a result file (no schema); delete it and run again")
     return document
+
+
+def _int(text: str) -> int:
+    if not text.lstrip("-").isdigit() or not -(2**63) <= (value := int(text)) < 2**63:
+        raise ValueError(f"{text:.20} is no number of a result")
+    return value
 
 
 def decoded(document: Mapping[str, Any], where: str) -> Result:
@@ -251,17 +259,16 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     try:
         if digest != _digest(document):
             raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
-        json.dumps(document, ensure_ascii=False).encode()  # refuses lone surrogates
         result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
         _refuse_other_types(result)
     except ResultError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise ResultError(f"{where}: {error}; delete it and run again") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ResultError(f"{where}: {str(error):.300}; delete it and run again") from error
     names = [result.run, result.method, result.preset, *result.experiments, *result.scores]
     for name in (*names, *filter(None, [result.dataset])):
         if not PLAIN.fullmatch(name):
-            raise ResultError(f"{where}: {name!r} is no name that this program gives; leave the file out")
+            raise ResultError(f"{where}: {name[:80]!r} is no name that this program gives; leave the file out")
     return result
 
 
@@ -292,6 +299,10 @@ def _refuse_other_types(result: Result) -> None:
     for name, value in result.timing.items():
         if value is not None and not 0 <= value < math.inf:
             raise ValueError(f"timing.{name} is {value}; it must be a time, at least 0")
+    names = [*vars(result).values(), *(view for scores in result.scores.values() for view in scores.views)]
+    for name in names:
+        if isinstance(name, str) and name != result.reason and len(name) > LONGEST_NAME:
+            raise ValueError(f"{name[:20]}... has {len(name)} letters; names have at most {LONGEST_NAME}")
     if not all(isinstance(name, str) for name in result.experiments):
         raise TypeError(f"experiments are {result.experiments!r}; they must be names")
     for name, count in result.counts.items():
@@ -300,8 +311,11 @@ def _refuse_other_types(result: Result) -> None:
     for name in CONFIG_GROUPS & result.config.keys():
         if not isinstance(result.config[name], dict):
             raise TypeError(f"config.{name} is {result.config[name]!r}; it must be a group of settings")
-    budget = result.config.get("budget", {})
-    float(budget.get("seconds") or 0)
+    stress, budget = result.config.get("stress", {}), result.config.get("budget", {})
+    if not isinstance(stress.get("condition"), (str, NoneType)) or not isinstance(stress.get("level"), (int, NoneType)):
+        raise TypeError(f"config.stress is {stress!r}; it must have a name and a level")
+    if float(budget.get("seconds") or 0) < 0:
+        raise ValueError(f"config.budget.seconds is {budget['seconds']}; it must be at least 0")
     if not PLAIN.fullmatch(str(clock := budget.get("clock", "wall"))):  # findings print it in a command
         raise ValueError(f"config.budget.clock is {clock!r}; it must be a name")
     rules = [*result.config.get("protocol", {}).values(), *(scores.protocol for scores in result.scores.values())]

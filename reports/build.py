@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pandas import DataFrame
 
 from padgs.reports import REPORTS, methods, published
-from padgs.reports.conditions import Reason, footnotes, refuse_mixture, unranked, unranked_notes
-from padgs.reports.frame import LARGEST_FACTOR, PUBLISHED_ITERATIONS, by_conditions, by_place, grouped, law
-from padgs.reports.measures import Measure
+from padgs.reports.conditions import Reason, as_published, footnotes, refuse_mixture, unranked, unranked_notes
+from padgs.reports.frame import CONFIG, LARGEST_FACTOR, PUBLISHED_ITERATIONS, by_conditions, by_place, grouped, law
+from padgs.reports.measures import Measure, quantity
 from padgs.reports.published import AVERAGE, Place, Published
-from padgs.reports.selection import RunSet, experiment_of, one_setting, refuse_differences, settings
+from padgs.reports.selection import Mixture, RunSet, experiment_of, one_setting, refuse_differences, settings
 from padgs.reports.significance import (
     SEEDS,
     mean_cell,
@@ -46,33 +47,52 @@ class _Builder:
         self.name, self.spec, self.request = name, SPECS[name], run_set.request
         self.runs = self._select(run_set)
         self.protocols = self.spec.protocols or (self.request.protocol,)
-        self.paper = published.load() if self.spec.paper and self.request.protocol == published.PROTOCOL else {}
+        beside = self.spec.paper and self.request.protocol == published.PROTOCOL
+        beside = beside and any(place.published for place in self.runs["place"])
+        self.paper = published.load() if beside else {}
         known = self.runs.columns[self.runs.notna().any()]
         measures = self.spec.measures(self.request.protocol)
+        if self.request.metrics and not self.spec.pivot:
+            own = {measure.name.rpartition("/")[2]: measure for measure in measures}
+            chosen = (own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics)
+            measures = tuple(chosen)
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
         self.unranked: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
 
     def build(self) -> Table:
-        blocks: dict[str, list[Block]] = {dataset: [] for dataset in self.spec.paper if self.spec.averages}
+        blocks: list[Block] = []
+        notes: list[str] = []
+        for dataset in self.spec.paper if self.spec.averages else ():
+            every = published.scenes(published.load(), published.DATASETS[dataset])
+            if done := [of for of in self._places() if of.dataset == dataset and not of.apart]:
+                done.sort(key=lambda place: every.index(place.scene) if place.scene in every else len(every))
+                blocks += self._average(published.TITLES[dataset], done, len(every))
+                if missing := [scene for scene in every if scene not in {place.scene for place in done}]:
+                    notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(missing)}.")
+                if self.spec.scenes_down:
+                    blocks += self._scenes_down(dataset, done)
+        if self.spec.averages:
+            others = [place for place in self._places() if not place.apart and place.dataset not in self.spec.paper]
+            try:
+                blocks += self._average("", others, len(others))
+            except Mixture as mixture:  # each scene has a block of its own all the same
+                notes.append(f"No mean over the scenes: {mixture.what}.")
         for title, place, runs in self._groups():
             refuse_mixture(runs, self.request, title, self.spec.conditions)
             self.shown[title] = runs
-            blocks.setdefault(place.dataset if self.spec.averages else "", []).extend(self._blocks(title, place, runs))
-        notes = []
-        for dataset in self.spec.paper if self.spec.averages else ():
-            scenes = published.scenes(self.paper or published.load(), published.DATASETS[dataset])
-            blocks[dataset].append(self._average(dataset, scenes))
-            done = {place.scene for place in self.runs["place"] if place.dataset == dataset}
-            if missing := [scene for scene in scenes if scene not in done]:
-                notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(missing)}.")
+            if not (self.spec.scenes_down and place.published and not place.apart):
+                blocks += self._blocks(title, place, runs)
         notes += footnotes(self.shown, *self.protocols)
         if self.paper:
-            delta = "; Δ = ours - paper" if any(measure.difference for measure in self.measures) else ""
-            notes.append(f"Columns 'paper': published numbers, from one RTX 3090 Ti{delta}.")
+            delta = any(measure.difference for measure in self.measures)
+            words = "; Δ = ours - paper, at the size and length of the paper only" if delta else ""
+            notes.append(f"'paper': published numbers, from one RTX 3090 Ti{words}.")
         notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference]), *self.spec.notes]
-        all_blocks = tuple(block for of in blocks.values() for block in of)
-        return Table(self.name, self.spec.title, self.spec.corner, self._columns(), all_blocks, tuple(notes))
+        return Table(self.name, self.spec.title, self.spec.corner, self._columns(), tuple(blocks), tuple(notes))
+
+    def _places(self) -> list[Place]:
+        return list(by_place(self.runs))
 
     def _select(self, run_set: RunSet) -> DataFrame:
         spec = self.spec
@@ -91,7 +111,7 @@ class _Builder:
         """Yield title, scene and runs of each block."""
         spec = self.spec
         if not spec.blocks:
-            for place, runs in {**dict.fromkeys(spec.always, self.runs.iloc[:0]), **by_place(self.runs)}.items():
+            for place, runs in by_place(self.runs).items():
                 yield place.title, place, runs
             return
         for experiment in REPORTS[self.name].experiments if spec.by_experiment else ("",):
@@ -118,7 +138,15 @@ class _Builder:
                 ours = over_seeds(own, self.measures)
                 cells[value] = unrank(ours) if value in not_ranked else ours
             heading = f"{methods.name(method)}, {title}" if spec.difference else title
-            yield Block(heading, self._rows(place, titles, cells))
+            theirs = {value: published.row(self.paper, *self._where(place), self._method(value)) for value in titles}
+            yield Block(heading, self._rows(titles, cells, theirs, runs))
+
+    def _where(self, place: Place) -> tuple[int, Place]:
+        return self.spec.paper.get(place.dataset, 0), place
+
+    def _method(self, value: str) -> str:
+        """Return the method of the published numbers that a row may stand beside."""
+        return f"padgs/{value}" if self.spec.rows == "variant" else methods.published_as(value)
 
     def _columns(self) -> tuple[Column, ...]:
         found = [Column("rank", 0)] if self.spec.by_rank else []
@@ -142,37 +170,73 @@ class _Builder:
         presets = methods.ordered((*known, *run))
         return {preset: methods.title(preset) if preset in run else methods.name(preset) for preset in presets}
 
-    def _rows(self, place: Place, titles: Mapping[str, str], cells: Mapping[str, Sequence[Cell]]) -> tuple[Row, ...]:
+    def _rows(
+        self,
+        titles: Mapping[str, str],
+        cells: Mapping[str, Sequence[Cell]],
+        theirs: Mapping[str, Mapping[str, Published]],
+        runs: DataFrame,
+    ) -> tuple[Row, ...]:
         """Return a row for each value, with published numbers and differences."""
         first, rows = next(iter(cells.values()), ()), []
         for value, ours in cells.items():
-            method = f"padgs/{value}" if self.spec.rows == "variant" else methods.published_as(value)
-            theirs = published.row(self.paper, self.spec.paper.get(place.dataset, 0), place, method)
+            comparable = as_published(runs.loc[runs[self.spec.rows] == value])
             row: list[Cell] = []
             for index, (measure, cell) in enumerate(zip(self.measures, ours, strict=True)):
                 row.append(cell)
                 if self.paper and measure.published:
-                    row.append(_published(theirs.get(measure.published)))
+                    row.append(_published(theirs[value].get(measure.published)))
                     if measure.difference:
-                        row.append(_difference(cell, row[-1]))
+                        row.append(_difference(cell, row[-1]) if comparable else Cell())
                 if self.spec.difference and _is_psnr(measure):
                     row.append(_difference(cell, first[index]))
             rows.append(Row(titles[value], tuple(row)))
         return tuple(rows)
 
-    def _average(self, dataset: str, scenes: Sequence[str]) -> Block:
-        """Return a block with the mean over the scenes of a data set."""
-        title, place = published.TITLES[dataset], Place(dataset, AVERAGE)
-        runs = self.runs.loc[[(of.dataset, of.apart) == (dataset, "") for of in self.runs["place"]]]
-        refuse_mixture(runs, self.request, title, [what for what in self.spec.conditions if what != "data"])
+    def _average(self, title: str, places: Sequence[Place], count: int) -> list[Block]:
+        """Return a block with the mean over scenes, beside the paper's over the same; none for a single scene."""
+        if len(places) < 2:
+            return []
+        runs = self.runs.loc[self.runs["place"].isin(places)]
+        words = f"{len(places)} of its {count} scenes" if len(places) < count else f"its {count} scenes"
+        heading = f"{title}, average over {words}" if title else f"Average over {count} scenes"
+        if not title or len(places) < count:
+            heading += f": {', '.join(place.label for place in places)}"
+        refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.conditions if of != "data"])
         self.unranked.append(unranked(runs))
-        titles, cells = self._titles(place, runs), {}
+        titles, cells, theirs = self._titles(Place(places[0].dataset, AVERAGE), runs), {}, {}
+        settings = runs.drop(columns=[column for column in runs if column.startswith(f"{CONFIG}data.")])
         for preset, words in titles.items():
-            alike = runs.loc[runs["preset"] == preset]
-            refuse_differences(alike, f"{title}, {words}", "preset")
-            ours = over_scenes(alike, scenes, self.measures)
+            alike = settings.loc[settings["preset"] == preset]
+            refuse_differences(alike, f"{title or heading}, {words}", "preset")
+            ours = over_scenes(alike, places, self.measures)
             cells[preset] = unrank(ours) if preset in self.unranked[-1] else ours
-        return Block(f"{title}, average over its {len(scenes)} scenes", self._rows(place, titles, cells))
+            if title and self.paper:
+                chosen = (places[0].dataset, [place.scene for place in places], self._method(preset))
+                theirs[preset] = published.mean_row(self.paper, self.spec.paper[places[0].dataset], *chosen)
+        return [Block(heading, self._rows(titles, cells, {**dict.fromkeys(titles, {}), **theirs}, runs))]
+
+    def _scenes_down(self, dataset: str, places: Sequence[Place]) -> Iterator[Block]:
+        """Yield a block for each measure in the layout of the paper: scenes down, methods across."""
+        own = {place: self.runs.loc[self.runs["place"] == place] for place in places}
+        titles: dict[str, str] = {}
+        for place, runs in own.items():
+            titles |= self._titles(place, runs)
+        blocks = {place: next(iter(self._blocks(place.title, place, runs))) for place, runs in own.items()}
+        columns = self._columns()
+        for measure in self.measures:
+            start, rows = columns.index(measure.column), []
+            kinds = ["", *(column.title for column in columns[start + 1 : start + 3] if self.paper)]
+            for place, block in blocks.items():
+                by_title = {row.title: row.cells for row in block.rows}
+                for offset, kind in enumerate(kinds):  # ours, the paper's and the difference
+                    cells = tuple(by_title[t][start + offset] if t in by_title else Cell() for t in titles.values())
+                    if not kind or any(cell != Cell() for cell in cells):
+                        rows.append(Row(f"{place.scene}, {kind}" if kind else place.scene, cells, kind == "Δ"))
+            across = replace(measure.column, title=published.TITLES[dataset])
+            shown = [replace(measure.column, title=title, group="", higher_is_better=None) for title in titles.values()]
+            heading = f"{measure.column.heading}, {published.TITLES[dataset]}"
+            yield Block(heading, tuple(rows), own_columns=tuple(shown), across=across)
 
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
         """Return a row for each setting, the best first, those without a number last."""

@@ -13,8 +13,8 @@ import yaml
 from pandas import DataFrame
 
 from padgs.reports import REPORTS, methods, published
-from padgs.reports.conditions import PUBLISHED_WIDTH, refuse_mixture
-from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, grouped
+from padgs.reports.conditions import as_published, refuse_mixture
+from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
 from padgs.reports.published import DATASETS, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
@@ -271,7 +271,7 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
             row |= {"scene": found["place"].label, "size": size, "length": length, "width": int(size.partition("x")[0])}
             row["iterations"] = alike["iterations"].max()
-            row["as published"] = bool(row["width"] >= PUBLISHED_WIDTH and row["iterations"] >= PUBLISHED_ITERATIONS)
+            row["as published"] = as_published(alike)
             key = tuple(found[name] for name in ("place", *claim.within))
             rank = itemgetter("tested", "width", "iterations")
             best[key] = max(row, best[key], key=rank) if key in best else row

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pandas as pd
 from pandas import DataFrame
 
-from padgs.reports.frame import CONFIG
+from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS
 from padgs.reports.methods import name, title
 from padgs.reports.selection import Mixture, Request
 from padgs.reports.table import UNRANKED
@@ -61,15 +61,18 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
             raise Mixture(difference, "choose with --where, or compare them anyway with --mix", runs, [column])
 
 
+def as_published(runs: DataFrame) -> bool:
+    """Return whether runs have the size and the length of the paper, without which numbers cannot be compared."""
+    lengths = (f"{PUBLISHED_LENGTHS.get(method, PUBLISHED_ITERATIONS)} iterations" for method in runs["method"])
+    widths = runs["resolution"].map(lambda size: int(size.partition("x")[0]))
+    return bool(len(runs) and (widths >= PUBLISHED_WIDTH).all() and (runs["length"] == [*lengths]).all())
+
+
 def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
-    """Return a sentence with the conditions of the runs, for all blocks that share them, under each protocol."""
-    return [note for protocol in protocols for note in _footnotes(blocks, protocol)]
-
-
-def _footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
+    """Return a sentence with the conditions of the runs, for all blocks that share them."""
     titles: dict[str, list[str]] = {}
     for block, runs in blocks.items():
-        titles.setdefault(_sentence(runs, protocol), []).append(block)
+        titles.setdefault(_sentence(runs, protocols), []).append(block)
     notes = [f"{'; '.join(of)}: {sentence}" for sentence, of in titles.items()]
     for method, length in PUBLISHED_LENGTHS.items():
         if any(((runs["method"] == method) & (runs["iterations"] < length)).any() for runs in blocks.values()):
@@ -81,15 +84,17 @@ def _footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
     return notes
 
 
-def _sentence(runs: DataFrame, protocol: str) -> str:
+def _sentence(runs: DataFrame, protocols: Iterable[str]) -> str:
     if runs.empty:
         return "not run."
-    columns = {what: _values(runs, what, protocol) for what in (*OF_A_DATA_SET, "seed", "code_version", "hardware")}
-    columns["seed"] = columns["seed"].sort_values()
-    rules, sizes, lengths, rates, seeds, versions, machines = (
-        " / ".join(map(str, values.unique())) or "none" for values in columns.values()
+    others = (*OF_A_DATA_SET[1:], "seed", "code_version", "hardware")
+    columns = [_values(runs, "protocol", protocol) for protocol in protocols]
+    columns += [runs[what].dropna().sort_values() if what == "seed" else runs[what].dropna() for what in others]
+    *rules, sizes, lengths, rates, seeds, versions, machines = (
+        " / ".join(map(str, values.unique())) or "none" for values in columns
     )
-    return f"protocol {rules}, {sizes}, {lengths}, learning rates {rates}, seeds {seeds}, padgs {versions}, {machines}."
+    made = f"learning rates {rates}, seeds {seeds}, padgs {versions}, {machines}."
+    return f"protocol {'; '.join(rules)}, {sizes}, {lengths}, {made}"
 
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:

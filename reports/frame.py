@@ -20,7 +20,7 @@ from pandas import DataFrame
 from padgs.checks import printable
 from padgs.reports.published import Place
 from padgs.reports.store import Run
-from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_STATED, Result, Scores, picture_name
+from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, picture_name
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
@@ -32,17 +32,23 @@ LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.trainin
 def frame(runs: Iterable[Run]) -> DataFrame:
     """Return the frame of runs in their order; the index counts them."""
     runs = list(runs)
-    results = [_cleaned(run.result) for run in runs]
-    facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()}, dtype=object)
+    parts = [[run.row[part] for run in runs] for part in range(5)]
+    facts, rules = (_columns(rows, object, names) for rows, names in zip(parts[:2], (FACTS, ()), strict=True))
     facts["log"], facts["renders"] = [run.log for run in runs], [run.renders for run in runs]
-    numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
+    metrics, numbers = _columns(parts[2], float), _columns(parts[3], float, NUMBERS)
     last = [run.log.get("polar_transmittance", ())[-1:] for run in runs]
     numbers["polar_transmittance"] = [value[0] if value else math.nan for value in last]
     numbers["train_hours"], numbers["fps"] = numbers["train_seconds"] / 3600, 1000 / numbers["frame_ms"]
-    rules = _columns([dict(_rules(result)) for result in results], object)
-    metrics = _columns([dict(_metrics(result)) for result in results], float)
-    config = _columns([dict(_flat(result.config)) for result in results], object).add_prefix(CONFIG)
+    config = _columns(parts[4], object).add_prefix(CONFIG)
     return pd.concat([facts.astype({"ok": bool}), rules, metrics, numbers, config], axis=1)
+
+
+def row_of(run: Run) -> tuple[dict[str, Any], ...]:
+    """Return the facts, rules, metrics, numbers and configuration of a run; any exception if it has other values."""
+    result = _cleaned(run.result)
+    numbers = {name: None if (value := of(result)) is None else float(value) for name, of in NUMBERS.items()}
+    facts = {name: of(result) for name, of in FACTS.items()}
+    return facts, dict(_rules(result)), dict(_metrics(result)), numbers, dict(_flat(result.config))
 
 
 def _cleaned(result: Result) -> Result:
@@ -144,9 +150,9 @@ def _machine(result: Result) -> str:
     return _hardware(result) + (f", {threads} threads" if threads else "")
 
 
-def _columns(rows: Sequence[Mapping[str, Any]], dtype: type) -> DataFrame:
-    """Return a column for each name in any row; missing values are None, or NaN among numbers."""
-    names = dict.fromkeys(name for row in rows for name in row)
+def _columns(rows: Sequence[Mapping[str, Any]], dtype: type, names: Iterable[str] = ()) -> DataFrame:
+    """Return a column for each name, given or in any row; missing values are None, or NaN among numbers."""
+    names = dict.fromkeys([*names, *(name for row in rows for name in row)])
     return DataFrame({name: [row.get(name) for row in rows] for name in names}, index=range(len(rows)), dtype=dtype)
 
 
@@ -190,6 +196,20 @@ def _factor(result: Result) -> float | None:
     return 1.0 if choice == "published" else law(result.iterations) if choice == "run" else float(choice)
 
 
+def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a search for the smallest model found, if it has the numbers that tables and charts show."""
+    for step in found.get("steps", ()):
+        numbers = [step[name] for name in ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr")]
+        if not all(0 < float(number) < math.inf for number in numbers[:3]):
+            raise ValueError(f"a step of `smallest` has {numbers[:3]} rows, Gaussians and bytes")
+        [float(number) for number in (*numbers, *(step[name] or 0 for name in ("test_ws_psnr", "lpips")))]
+    if "steps" in found:
+        [found["steps"][found["minimal"][f"{loss:g}"]] for loss in SMALLEST_LOSSES]
+        [float(found[name] or 0) for name in ("rows", "cpu_seconds", "test_ws_psnr")]
+        found["steps"][found["knee"] or 0]
+    return found
+
+
 def _minimal_count(found: Mapping[str, Any]) -> float | None:
     """Return the Gaussians of the smallest model for a loss of `SMALLEST_STATED` dB, if it was searched."""
     return found["steps"][found["minimal"][f"{SMALLEST_STATED:g}"]]["blended"] if "steps" in found else None
@@ -224,7 +244,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
         name: attrgetter(name)
         for name in (
             *("run", "ok", "status", "method", "preset", "variant", "dataset", "scene", "seed", "iterations"),
-            *("code_version", "finished", "smallest"),
+            *("code_version", "finished"),
         )
     },
     "experiments": lambda result: result.experiments or (AD_HOC,),
@@ -238,6 +258,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "setting": lambda result: json.dumps(
         {key: value for key, value in _flat(result.config) if decides(key)}, sort_keys=True
     ),
+    "smallest": lambda result: _searched(result.smallest),
     "view_psnr": lambda result: _view_psnr(result.scores),
 }
 NUMBERS: Mapping[str, Callable[[Result], float | None]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,13 +70,10 @@ class Place:
 
     @property
     def title(self) -> str:
-        """Title with origin, so that no stand-in is taken for a scene of the paper."""
-        if self.published:
+        """Title with the data set."""
+        if self.published or not self.dataset:
             return self.heading
-        if not self.dataset:
-            return f"{self.label} (a capture that is no scene of the paper)"
-        origin = "built in, generated" if self.dataset == BUILT_IN else f"of {self.dataset}"
-        return f"{self.label} ({origin}; no scene of the paper)"
+        return f"{self.label} ({'generated' if self.dataset == BUILT_IN else self.dataset})"
 
     @property
     def stem(self) -> str:
@@ -110,6 +107,18 @@ def row(numbers: Mapping[Key, Published], table: int, place: Place, method: str)
     """Return metric -> number of a method on a scene; empty where the paper has none."""
     where = (table, DATASETS.get(place.dataset), place.scene, method)
     return {k.metric: n for k, n in numbers.items() if (k.table, k.dataset, k.scene, k.method) == where}
+
+
+def mean_row(
+    numbers: Mapping[Key, Published], table: int, dataset: str, chosen: Sequence[str], method: str
+) -> dict[str, Published]:
+    """Return metric -> mean of a method over some scenes of a data set, where the paper has a number for each."""
+    if set(chosen) == set(scenes(numbers, DATASETS[dataset])):
+        return row(numbers, table, Place(dataset, AVERAGE), method)
+    rows = [row(numbers, table, Place(dataset, scene), method) for scene in chosen]
+    known = [{name: number.value for name, number in own.items() if number.value is not None} for own in rows]
+    shared = set.intersection(*map(set, known))
+    return {name: Published(sum(own[name] for own in known) / len(known), "ok") for name in shared}
 
 
 def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:

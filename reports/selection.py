@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from importlib import import_module
 from typing import Any
 
@@ -49,6 +50,8 @@ class Request:
     metrics: tuple[str, ...] = ()  # of the curves of sweeps; empty: those of the protocol, and costs
     experiment: str = ""  # only runs of this experiment or sweep, with or without its scale
     where: Mapping[str, str] = field(default_factory=dict)  # dotted configuration key -> value
+    methods: tuple[str, ...] = ()  # names or patterns of presets; empty: all
+    scenes: tuple[str, ...] = ()  # names or patterns of scenes or data sets; empty: all
 
     def matches(self, name: str) -> bool:
         """Return whether an experiment of this name is requested.
@@ -152,7 +155,19 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
         if not any(map(request.matches, known)):
             raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
         runs = runs.loc[[any(map(request.matches, of)) for of in runs["experiments"]]]
-    for key, value in request.where.items() if len(every) else ():
+    where = dict(request.where)
+    chosen = {
+        ("preset", "method"): (*request.methods, *filter(None, [where.pop("method", "")])),
+        ("scene", "dataset"): (*request.scenes, *filter(None, [where.pop("scene", "")])),
+    }
+    for columns, patterns in chosen.items() if len(every) else ():
+        if patterns:
+            own = [_is_one_of(names, patterns) for names in runs[list(columns)].itertuples(index=False)]
+            if not any(own):
+                known = ", ".join(sorted(every[columns[0]].unique()))
+                raise ReportError(f"no run has {columns[0]} {', '.join(patterns)}; runs have {known}")
+            runs = runs.loc[own]
+    for key, value in where.items() if len(every) else ():
         column = f"{CONFIG}{key}"
         if column not in every or every[column].isna().all():
             first = every.iloc[0]
@@ -163,6 +178,12 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             values = ", ".join(sorted(set(every[column].dropna().map(str))))
             raise ReportError(f"no run has {key}={value}; runs have {values}")
     return runs
+
+
+def _is_one_of(names: Collection[str], patterns: Iterable[str]) -> bool:
+    """Return whether a name fits a pattern; - and _ are alike, because `padgs-run` has scenes with _."""
+    plain = [name.replace("_", "-") for name in names]
+    return any(fnmatchcase(name, pattern.replace("_", "-")) for name in plain for pattern in patterns)
 
 
 def experiment_of(name: str) -> str:

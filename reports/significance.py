@@ -11,7 +11,8 @@ import numpy as np
 from pandas import DataFrame
 
 from padgs.reports.measures import Measure
-from padgs.reports.table import Block, Cell, Column, format_number
+from padgs.reports.published import Place
+from padgs.reports.table import Block, Cell, Column, Row, format_number
 
 BEST, SECOND = "best", "second"
 CONFIDENCE = 0.95
@@ -36,15 +37,16 @@ def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:
     return [mean_cell(column[~np.isnan(column)].tolist(), failed) for column in numbers.T]
 
 
-def over_scenes(runs: DataFrame, scenes: Sequence[str], measures: Sequence[Measure]) -> list[Cell]:
+def over_scenes(runs: DataFrame, scenes: Sequence[Place], measures: Sequence[Measure]) -> list[Cell]:
     """Return a cell for each measure: mean over scenes, standard deviation over seeds that every scene has.
 
     Missing if any scene has no number, because means over different scenes cannot be compared.
     """
-    by_seed = numbers_of(runs, measures).groupby([runs["seed"], runs["scene"]]).last()
+    places = runs["place"].map(lambda place: place.title).rename("place")
+    by_seed, titles = numbers_of(runs, measures).groupby([runs["seed"], places]).last(), [one.title for one in scenes]
     found = []
     for measure in measures:
-        complete = by_seed[measure.name].unstack("scene").reindex(columns=scenes).dropna()
+        complete = by_seed[measure.name].unstack("place").reindex(columns=titles).dropna()
         found.append(mean_cell([math.fsum(values) / len(scenes) for values in complete.to_numpy()]))
     return found
 
@@ -61,6 +63,16 @@ def mean_cell(values: Sequence[float], failed: str = "") -> Cell:
     finite = all(math.isfinite(value) for value in values)
     std = statistics.stdev(values) if len(values) > 1 and finite else None
     return Cell(math.fsum(values) / len(values), std, len(values), failed)
+
+
+def marks(block: Block, columns: tuple[Column, ...]) -> list[dict[int, str]]:
+    """Return row -> BEST or SECOND for each column of a block; see `NOTE`."""
+    if block.across is None:
+        return [emphasis(block, index, columns) for index in range(len(columns))]
+    rows = [
+        emphasis(Block("", tuple(Row("", (cell,)) for cell in row.cells)), 0, (block.across,)) for row in block.rows
+    ]
+    return [{number: row[index] for number, row in enumerate(rows) if index in row} for index in range(len(columns))]
 
 
 def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int, str]:

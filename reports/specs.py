@@ -16,7 +16,6 @@ from padgs.reports import methods
 from padgs.reports.conditions import CONDITIONS, OF_PARTS, OF_TIMES
 from padgs.reports.frame import CONFIG
 from padgs.reports.measures import Measure, costs, metric, metrics
-from padgs.reports.published import Place
 from padgs.reports.selection import is_number
 from padgs.reports.significance import NOTE, SEEDS
 
@@ -37,7 +36,6 @@ class Spec:
     # Blocks: one a scene, and ...
     blocks: tuple[str, ...] = ()  # ... a value of these columns
     by_experiment: bool = False  # ... an experiment
-    always: tuple[Place, ...] = ()  # scenes that have a block even if they were not run
     conditions: tuple[str, ...] = OF_TIMES  # shared by all runs of a block
     # Rows
     rows: str = "preset"  # column whose values are rows; "setting": see `selection.settings`; "run": all runs
@@ -47,7 +45,8 @@ class Spec:
     equal_images: bool | None = None  # leave out of the ranking: see `conditions.unranked`; None: nothing
     # Columns of the paper, and notes
     paper: Mapping[str, int] = field(default_factory=dict)  # data set -> table of the paper
-    averages: bool = False  # a block with the mean over each data set of `paper`
+    averages: bool = False  # a block with the mean over each data set of `paper`, and over all other scenes
+    scenes_down: bool = False  # the data sets of `paper` have a block for each measure, with methods across
     pivot: tuple[str, ...] = ()  # columns of the frame whose values are columns of the first measure
     protocols: tuple[str, ...] = ()  # of the footnotes; empty: that of the request
     notes: tuple[str, ...] = (NOTE,)
@@ -129,7 +128,7 @@ def _crossed(runs: DataFrame) -> DataFrame:
 
 SPECS: Mapping[str, Spec] = {
     "table1": Spec(
-        "Quality on the 11 indoor scenes of 360Roam, and on other indoor scenes",
+        "Quality on indoor scenes",
         metrics,
         fallback=True,
         outdoor=False,
@@ -137,9 +136,10 @@ SPECS: Mapping[str, Spec] = {
         equal_images=True,
         paper=INDOOR,
         averages=True,
+        scenes_down=True,
     ),
     "table2": Spec(
-        "Quality on the 12 outdoor scenes of Ricoh360, and on other outdoor scenes",
+        "Quality on outdoor scenes",
         metrics,
         fallback=True,
         outdoor=True,
@@ -147,13 +147,13 @@ SPECS: Mapping[str, Spec] = {
         equal_images=True,
         paper=OUTDOOR,
         averages=True,
+        scenes_down=True,
     ),
     "table3": Spec(
         "Ablation of PaD-GS: distortion-aware decoding (DAGD), opacity modulation (DAOM), solid-angle weight (M)",
         metrics,
         "Variant",
         fallback=True,
-        always=(Place("roam360", "bar"), Place("ricoh360", "cat_tower")),
         conditions=CONDITIONS,
         rows="variant",
         titles={"padgs": PARTS},
@@ -179,6 +179,7 @@ SPECS: Mapping[str, Spec] = {
         "Every method after the same number of iterations",
         lambda _: EVERYTHING,
         fallback=True,
+        averages=True,
         equal_images=True,
         protocols=("paper", "sphere"),
     ),

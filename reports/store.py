@@ -7,13 +7,13 @@ Pictures are not stored.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from PIL import Image
 
 from padgs import results
@@ -21,6 +21,7 @@ from padgs.files import DAMAGE, ImageError, open_image, write_atomically
 from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
+PATIENCE = 120  # seconds for other reports that add runs to the same store
 LOGGED = ("iteration", "seconds", "psnr")  # seconds of training so far; dB
 LOGGED_BY_SOME = ("polar_transmittance",)  # measured for PaD-GS only
 NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
@@ -34,6 +35,13 @@ class Run:
     log: Mapping[str, Sequence[float]] = field(default_factory=lambda: NO_LOG)  # name of `LOGGED` -> its values
     document: Mapping[str, Any] | None = None  # content of the result file
     renders: Path | None = None  # folder of ground truth | render | error of each test view; None in a store
+
+    @cached_property
+    def row(self) -> tuple[Mapping[str, Any], ...]:
+        """Parts of a row of the frame."""
+        from padgs.reports.frame import row_of  # imports this module
+
+        return row_of(self)
 
 
 def read(source: Path) -> tuple[list[Run], list[ResultError]]:
@@ -57,6 +65,16 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
     return runs, errors
 
 
+def _usable(run: Run, where: str) -> Run:
+    """Return a run of which a row can be made; other errors are those of a file from elsewhere."""
+    try:
+        run.row  # noqa: B018 - kept
+    except Exception as error:
+        why = f"{type(error).__name__}: {str(error):.300}"
+        raise ResultError(f"{where} has values that no run has ({why}); delete it and run again") from error
+    return run
+
+
 def add(runs: Iterable[Run], store: Path) -> list[Run]:
     """Add runs to a store, replacing those of the same name but for their experiments; return all runs in it.
 
@@ -64,6 +82,11 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
         ResultError: a line of the store is damaged, and would be lost.
         OSError: the store cannot be written; the old one stays.
     """
+    with FileLock(store.with_name(f".{store.name}.lock"), timeout=PATIENCE):
+        return _add(runs, store)
+
+
+def _add(runs: Iterable[Run], store: Path) -> list[Run]:
     stored, damaged = read(store) if store.exists() else ([], [])
     if damaged:
         raise damaged[0]
@@ -90,34 +113,42 @@ def split_image(path: Path, count: int) -> list[Image.Image]:
     """Return `count` parts of equal width that lie side by side in an image file.
 
     Raises:
-        OSError: the file is missing or truncated.
+        OSError: the file is missing, truncated, too large, or no such image.
     """
     with open_image(path) as image:
         try:
             image.load()
         except DAMAGE as error:
             raise ImageError(f"{path} is damaged ({error}); score the run again") from error
-        width = image.width // count
+        if not (width := image.width // count):
+            raise ImageError(f"{path} has a width of {image.width}, and not {count} images side by side; remove it")
         return [image.crop((part * width, 0, (part + 1) * width, image.height)) for part in range(count)]
 
 
 def _from_line(line: bytes, where: str) -> Run:
     document = results.parsed(line, where)
+    where += f" ({str(document.get('run')):.80})"
     log = document.pop("log", None)
     if not isinstance(log, dict) or not {*LOGGED} <= log.keys() <= {*LOGGED, *LOGGED_BY_SOME}:
         raise ResultError(f"{where} has no log of {', '.join(LOGGED)}; delete it and collect the run again")
-    return Run(results.decoded(document, where), log, document)
+    lengths = {len(values) if isinstance(values, list) else None for values in log.values()}
+    if len(lengths) > 1 or not all(_is_measured(name, value) for name in log for value in log[name] or ()):
+        raise ResultError(f"{where} has a log that no run writes; delete it and collect the run again")
+    return _usable(Run(results.decoded(document, where), log, document), where)
 
 
 def _from_folder(file: Path) -> Run:
     document = results.parsed(results.file_content(file), str(file))
-    probes = [line for line in results.log_lines(file.parent) if all(_is_finite(line.get(name)) for name in LOGGED)]
+    probes = [
+        line for line in results.log_lines(file.parent) if all(_is_measured(name, line.get(name)) for name in LOGGED)
+    ]
     log = {name: [probe[name] for probe in probes] for name in LOGGED}
     log |= {
         name: [probe[name] for probe in probes] for name in LOGGED_BY_SOME if probes and all(name in p for p in probes)
     }
-    return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)
+    return _usable(Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES), str(file))
 
 
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and math.isfinite(value)
+def _is_measured(name: str, value: Any) -> bool:
+    low = -1e9 if name == "psnr" else 0
+    return isinstance(value, (int, float)) and low <= value < 1e18  # refuses NaN, too

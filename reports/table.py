@@ -68,6 +68,7 @@ class Row:
 
     title: str
     cells: tuple[Cell, ...]
+    signed: bool = False  # differences
 
     def texts(self, columns: Sequence[Column]) -> list[str]:
         """Return title and cells as text; a number of seeds that all cells share moves to the title.
@@ -76,10 +77,14 @@ class Row:
         ['PaD-GS (n=5)', '26.02 ± 0.04', '0.800 ± 0.010']
         """
         counts = {cell.count for cell in self.cells if cell.std is not None}
-        title = self.title if all(cell.ranked for cell in self.cells) else f"{self.title} {UNRANKED}"
+        known = [cell for cell in self.cells if cell.value is not None]
+        unranked = bool(known) and not any(cell.ranked for cell in known)
+        title = f"{self.title} {UNRANKED}" if unranked else self.title
         title += f" (n={min(counts)})" if len(counts) == 1 else ""
-        cells = zip(self.cells, columns, strict=True)
-        return [title, *(cell.text(column, counted=len(counts) > 1) for cell, column in cells)]
+        columns = [replace(column, signed=True) for column in columns] if self.signed else columns
+        texts = (cell.text(column, counted=len(counts) > 1) for cell, column in zip(self.cells, columns, strict=True))
+        marks = ("" if unranked or cell.ranked else f" {UNRANKED}" for cell in self.cells)
+        return [title, *map("".join, zip(texts, marks, strict=True))]
 
 
 @dataclass(frozen=True)
@@ -88,10 +93,13 @@ class Block:
 
     title: str
     rows: tuple[Row, ...]
-    signed: bool = False  # differences or correlations: with signs, and without a best
+    signed: bool = False  # differences: with signs, and without a best
+    own_columns: tuple[Column, ...] = ()  # instead of the table's
+    across: Column | None = None  # all cells are of this column, and the best is sought within each row
 
     def columns(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return the table's columns as they apply to this block."""
+        columns = self.own_columns or columns
         if not self.signed:
             return tuple(columns)
         return tuple(replace(column, signed=True, higher_is_better=None) for column in columns)
@@ -110,14 +118,16 @@ class Table:
 
     def single(self, block: Block, *, drop_empty: bool = False) -> Table:
         """Return one block as a table without empty optional columns, or with `drop_empty` without any empty column."""
+        every = block.columns(self.columns)
         kept = [
             index
-            for index, column in enumerate(self.columns)
+            for index, column in enumerate(every)
             if not (column.optional or drop_empty) or any(row.cells[index] != Cell() for row in block.rows)
         ]
-        rows = tuple(Row(row.title, tuple(row.cells[index] for index in kept)) for row in block.rows)
-        columns = block.columns([self.columns[index] for index in kept])
-        return replace(self, columns=columns, blocks=(replace(block, rows=rows),))
+        rows = tuple(replace(row, cells=tuple(row.cells[index] for index in kept)) for row in block.rows)
+        columns = tuple(every[index] for index in kept)
+        corner = "Scene" if block.across else self.corner
+        return replace(self, corner=corner, columns=columns, blocks=(replace(block, rows=rows, own_columns=()),))
 
 
 def format_number(value: float, column: Column) -> str:

@@ -12,7 +12,7 @@ from pandas import DataFrame
 
 from padgs.files import write_atomically
 from padgs.reports.charts.drawing import Chart
-from padgs.reports.significance import BEST, emphasis
+from padgs.reports.significance import BEST, marks
 from padgs.reports.table import Table
 from padgs.results import file_name
 
@@ -74,7 +74,7 @@ def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
 def rows_of(table: Table) -> list[tuple[str, list[tuple[str, str | None]]]]:
     """Return title, and (text, rank) of each cell, of the rows of a table with one block."""
     (block,) = table.blocks
-    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
+    ranks = marks(block, table.columns)
     found = []
     for number, row in enumerate(block.rows):
         title, *texts = row.texts(table.columns)
@@ -102,10 +102,10 @@ def markdown(table: Table) -> str:
 
 def latex(table: Table) -> str:
     """Return LaTeX with booktabs, a `table` a block, shrunk to the page, with the notes below the last one."""
-    wide = len(table.columns) > COLUMNS_OF_A_PAGE
-    lines = [f"% needs \\usepackage{{adjustbox, booktabs{', pdflscape' if wide else ''}}}"]
+    lines = ["% needs \\usepackage{adjustbox, booktabs, pdflscape}"]
     for number, block in enumerate(table.blocks):
         single = table.single(block)
+        wide = len(single.columns) > COLUMNS_OF_A_PAGE
         label = f"tab:{table.name}" + (f"-{number + 1}" if number else "")
         lines += [
             *([r"\begin{landscape}"] if wide else []),
@@ -132,7 +132,7 @@ def csv_text(table: Table) -> str:
     rows = []
     for block in table.blocks:
         columns = block.columns(table.columns)
-        ranks = [emphasis(block, index, columns) for index in range(len(columns))]
+        ranks = marks(block, columns)
         for number, row in enumerate(block.rows):
             for cell, column, rank in zip(row.cells, columns, ranks, strict=True):
                 place = {"table": table.name, "block": block.title, "row": row.title}

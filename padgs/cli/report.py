@@ -24,7 +24,13 @@ def report(
     out: Annotated[str, typer.Option(help="folder of the files; default: reports in or beside RUNS")] = "",
     protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
-    metric: Annotated[list[str] | None, typer.Option(help="metric of sweeps' curves, e.g. ws_psnr; repeatable")] = None,
+    metric: Annotated[
+        list[str] | None, typer.Option(help="columns of tables and curves of sweeps, e.g. ws_psnr; repeatable")
+    ] = None,
+    method: Annotated[list[str] | None, typer.Option(help="only these methods, e.g. odgs,padgs*; repeatable")] = None,
+    scene: Annotated[
+        list[str] | None, typer.Option(help="only these scenes or data sets, e.g. room,roam360; repeatable")
+    ] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
     mix: Annotated[bool, typer.Option(help="compare runs with different rules, sizes, lengths and machines")] = False,
     collect: Annotated[
@@ -46,7 +52,8 @@ def report(
     from padgs.reports.selection import Request, RunSet
     from padgs.reports.writers import files, write_files  # imports pandas, so not at the top
 
-    request = Request(protocol, mix, strict, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
+    names = {"metrics": _listed(metric), "methods": _listed(method), "scenes": _listed(scene)}
+    request = Request(protocol, mix, strict, experiment=experiment, where=_pairs(where), **names)
     found, broken = store.read(source)
     if collect:
         with _writing_to(target):
@@ -77,7 +84,7 @@ def report(
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     show(f"{len(found)} results, {len(broken)} left out; see {target}", sys.stderr)
-    for warning in run_set.warnings:
+    for warning in dict.fromkeys(run_set.warnings):
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):
         raise typer.Exit(1)
@@ -88,11 +95,19 @@ def _writing_to(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ReportError(f"cannot write to {folder}: {error.strerror}; name another folder with --out") from error
+        why = error.strerror or error
+        raise ReportError(f"cannot write to {folder}: {why}; name another folder with --out") from error
 
 
-def _pair(setting: str) -> tuple[str, str]:
-    key, equals, value = setting.partition("=")
-    if not equals:
-        raise ReportError(f"--where {setting} is not KEY=VALUE, e.g. --where train.iterations=3000")
-    return key, value
+def _listed(values: list[str] | None) -> tuple[str, ...]:
+    return tuple(name for value in values or () for name in value.split(",") if name)
+
+
+def _pairs(settings: list[str] | None) -> dict[str, str]:
+    pairs = {}
+    for setting in settings or ():
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise ReportError(f"--where {setting} is not KEY=VALUE, e.g. --where train.iterations=3000")
+        pairs[key] = value
+    return pairs

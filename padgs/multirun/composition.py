@@ -124,7 +124,7 @@ def register_choices() -> None:
             keys = method_fields(method)
             has_file = (root() / "conf" / "method" / f"{method}.yaml").exists()
             nodes = [] if has_file else [*method_choices(method)]
-        except Exception as error:  # of any kind: that package is not ours
+        except (Exception, SystemExit) as error:  # of any kind: that package is not ours
             if method in BUILT_IN:
                 raise
             del METHODS[method]

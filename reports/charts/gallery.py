@@ -32,14 +32,14 @@ def charts(run_set: RunSet) -> list[Chart]:
         refuse_mixture(own, run_set.request, where, ("protocol", "data"))
         own = own.sort_values("seed", kind="stable").drop_duplicates("preset")
         shared = sorted(set.intersection(*(set(render_names(folder)) for folder in own["renders"])))
-        if shared and (images := _images(own, view := shared[len(shared) // 2])):
+        if shared and (images := _images(own, view := shared[len(shared) // 2], run_set.warnings)):
             name = file_name(f"gallery_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
             title = f"{where}\ntest view {Path(view).stem}, below each render its error, with the PSNR of this view"
             found.append(_sheet(name, title, images, tuple(footnotes({where: own}, run_set.request.protocol))))
     return found
 
 
-def _images(runs: DataFrame, view: str) -> list[tuple[str, Image.Image]]:
+def _images(runs: DataFrame, view: str, warnings: list[str]) -> list[tuple[str, Image.Image]]:
     """Return titles and images of a view: ground truth, then each render above its error, by falling PSNR.
 
     There is none if no file can be read.
@@ -48,8 +48,9 @@ def _images(runs: DataFrame, view: str) -> list[tuple[str, Image.Image]]:
     for run in runs.to_dict("records"):
         try:
             truth, *drawn = split_image(run["renders"] / view, 3)
-        except OSError:
-            continue  # an incomplete file of a killed run
+        except OSError as error:  # such as an incomplete file of a killed run
+            warnings.append(f"a picture is left out: {error}")
+            continue
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])
         image = stacked(drawn)
         renders.append((math.inf, title, image) if psnr is None else (-psnr, f"{title}: {psnr:.2f} dB", image))

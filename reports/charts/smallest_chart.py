@@ -38,7 +38,10 @@ def charts(run_set: RunSet) -> list[Chart]:
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
         if rendered := [curve for curve in curves(own) if curve.image is not None]:
-            found.append(_renders(f"{name}_renders", title, rendered, notes))
+            try:
+                found.append(_renders(f"{name}_renders", title, rendered, notes))
+            except OSError as error:
+                run_set.warnings.append(f"a picture is left out: {error}")
     return found
 
 

@@ -162,16 +162,16 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) ->
     finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]
     if len(group) == 1:
         finished = list(group)  # a setting that failed has no point
-    first, scenes = next(iter(group)), [place.scene for place in finished]
+    first = next(iter(group))
     points = []
     for setting in found if finished else ():
-        cells = over_scenes(setting.runs, scenes, measures)
+        cells = over_scenes(setting.runs, finished, measures)
         if any(cell.value is not None for cell in cells):
             titles = [measure.column.title for measure in measures]
             points.append(Point(setting.title, setting.preset, dict(zip(titles, cells, strict=True))))
     what = first.title if len(group) == 1 else published.TITLES[name]
     if len(group) > 1 or first.published:
-        what += f", mean over its scenes {', '.join(scenes)}"
+        what += f", mean over its scenes {', '.join(place.scene for place in finished)}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol)
     return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes))

@@ -22,7 +22,7 @@ from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
 from padgs.reports.selection import RunSet, Setting, settings
 from padgs.reports.store import render_names, split_image
-from padgs.reports.table import Cell, ReportError, Row, Table
+from padgs.reports.table import Block, Cell, ReportError, Row, Table
 from padgs.reports.writers import rows_of
 
 HERE = Path(__file__).resolve().parent
@@ -101,7 +101,7 @@ def album(run_set: RunSet) -> Album:
         if opened > MAX_FILES:
             made.left_out.append(place.title)
             continue
-        views = [view for name in names if (view := _view(made, shown, name))["methods"]]
+        views = [view for name in names if (view := _view(made, shown, name, run_set.warnings))["methods"]]
         if views:
             made.scenes.append({"title": place.title, "views": views})
     return made
@@ -112,7 +112,7 @@ def _mean_psnr(setting: Setting) -> float:
     return sum(known) / len(known) if known else -math.inf
 
 
-def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
+def _view(made: Album, shown: Sequence[Setting], name: str, warnings: list[str]) -> dict[str, Any]:
     view: dict[str, Any] = {"title": Path(name).stem, "truth": None, "methods": []}
     for setting in shown:
         runs = setting.runs.loc[[(folder / name).is_file() for folder in setting.runs["renders"]]]
@@ -121,8 +121,9 @@ def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
         run = runs.iloc[0]
         try:
             truth, render, error = split_image(run["renders"] / name, 3)
-        except OSError:
-            continue  # an incomplete file of a killed run
+        except OSError as error:  # such as an incomplete file of a killed run
+            warnings.append(f"a picture is left out: {error}")
+            continue
         if view["truth"] is None:
             view["truth"] = made.add(truth)
         images = {"render": made.add(render), "error": made.add(error, IMAGE_WIDTH // 2)}
@@ -152,11 +153,12 @@ def _facts(runs: DataFrame) -> list[tuple[str, str]]:
 
 def _measured(table: Table) -> Table:
     """Return a table without the blocks that have only published numbers."""
-    ours = [index for index, column in enumerate(table.columns) if column.title not in PAPER_COLUMNS]
-    blocks = (
-        block for block in table.blocks if any(row.cells[index] != Cell() for row in block.rows for index in ours)
-    )
-    return replace(table, blocks=tuple(blocks))
+
+    def has_ours(block: Block) -> bool:
+        ours = [index for index, one in enumerate(block.columns(table.columns)) if one.title not in PAPER_COLUMNS]
+        return any(row.cells[index] != Cell() for row in block.rows for index in ours)
+
+    return replace(table, blocks=tuple(filter(has_ours, table.blocks)))
 
 
 def _table(table: Table) -> dict[str, Any]:
