@@ -228,8 +228,10 @@ def parsed(content: bytes, where: str) -> dict[str, Any]:
     try:
         document = json.loads(content, parse_constant=_int, parse_int=_int)
         json.dumps(document, ensure_ascii=False, allow_nan=False).encode()  # not possible for lone surrogates
-    except (ValueError, RecursionError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ResultError(f"{where} is not JSON ({error}); delete it and run again") from error
+    except ValueError as error:
+        raise ResultError(f"{where}: {error}; delete it and run again") from error
     if not isinstance(document, dict) or "schema" not in document:
         raise ResultError(f"{where} is not a result file (no schema); delete it and run again")
     return document

@@ -62,7 +62,13 @@ class _Builder:
 
     def build(self) -> Table:
         blocks: list[Block] = []
+        single: list[Block] = []
         notes: list[str] = []
+        for title, place, runs in self._groups():
+            refuse_mixture(runs, self.request, title, self.spec.conditions)
+            self.shown[title] = runs
+            if not (self.spec.scenes_down and place.published and not place.apart):
+                single += self._blocks(title, place, runs)
         for dataset in self.spec.paper if self.spec.averages else ():
             every = published.scenes(published.load(), published.DATASETS[dataset])
             if done := [of for of in self._places() if of.dataset == dataset and not of.apart]:
@@ -78,18 +84,13 @@ class _Builder:
                 blocks += self._average("", others, len(others))
             except Mixture as mixture:  # each scene has a block of its own all the same
                 notes.append(f"No mean over the scenes: {mixture.what}.")
-        for title, place, runs in self._groups():
-            refuse_mixture(runs, self.request, title, self.spec.conditions)
-            self.shown[title] = runs
-            if not (self.spec.scenes_down and place.published and not place.apart):
-                blocks += self._blocks(title, place, runs)
         notes += footnotes(self.shown, *self.protocols)
         if self.paper:
             delta = any(measure.difference for measure in self.measures)
             words = "; Δ = ours - paper, at the size and length of the paper only" if delta else ""
             notes.append(f"'paper': published numbers, from one RTX 3090 Ti{words}.")
         notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference]), *self.spec.notes]
-        return Table(self.name, self.spec.title, self.spec.corner, self._columns(), tuple(blocks), tuple(notes))
+        return Table(self.name, self.spec.title, self.spec.corner, self._columns(), (*blocks, *single), tuple(notes))
 
     def _places(self) -> list[Place]:
         return list(by_place(self.runs))

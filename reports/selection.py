@@ -165,7 +165,8 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             own = [_is_one_of(names, patterns) for names in runs[list(columns)].itertuples(index=False)]
             if not any(own):
                 known = ", ".join(sorted(every[columns[0]].unique()))
-                raise ReportError(f"no run has {columns[0]} {', '.join(patterns)}; runs have {known}")
+                name = columns[0].replace("preset", "method")
+                raise ReportError(f"no run has {name} {', '.join(patterns)}; runs have {known}")
             runs = runs.loc[own]
     for key, value in where.items() if len(every) else ():
         column = f"{CONFIG}{key}"

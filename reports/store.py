@@ -7,6 +7,7 @@ Pictures are not stored.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -126,8 +127,9 @@ def split_image(path: Path, count: int) -> list[Image.Image]:
 
 
 def _from_line(line: bytes, where: str) -> Run:
+    if run := re.search(rb'"run":\s*"([\w.-]{1,99})', line):  # even of a line that cannot be parsed
+        where += f" ({run[1].decode()})"
     document = results.parsed(line, where)
-    where += f" ({str(document.get('run')):.80})"
     log = document.pop("log", None)
     if not isinstance(log, dict) or not {*LOGGED} <= log.keys() <= {*LOGGED, *LOGGED_BY_SOME}:
         raise ResultError(f"{where} has no log of {', '.join(LOGGED)}; delete it and collect the run again")

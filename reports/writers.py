@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}
 MARKDOWN_MARKS = {None: "{}", BEST: "**{}**"}
 MARKDOWN_SPECIAL = re.compile(r"[\\`*_\[\]|~$#<]|&(?=[#\w])|:(?=//)|(?<=www)\.")
 ENTITIES = {"<": "&lt;", "&": "&amp;"}
+LONGEST = 200  # letters of the name of a chart
 COLUMNS_OF_A_PAGE = 12  # upright
 
 
@@ -49,7 +51,7 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
         for extension, write in (("md", markdown), ("tex", latex), ("csv", csv_text)) if made.blocks else ():
             yield f"{made.name}.{extension}", write(made).encode()
     elif isinstance(made, Chart):
-        name = file_name(made.name)
+        name = _short(file_name(made.name))
         yield f"{name}.png", made.png
         if svg:
             yield f"{name}.svg", made.svg.encode()
@@ -58,6 +60,11 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
     else:
         for part in made:
             yield from files(part, svg)
+
+
+def _short(name: str) -> str:
+    """Return a name that file systems accept with an ending."""
+    return name if len(name) <= LONGEST else f"{name[: LONGEST - 10]}-{hashlib.sha256(name.encode()).hexdigest()[:9]}"
 
 
 def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
@@ -111,7 +118,7 @@ def latex(table: Table) -> str:
             *([r"\begin{landscape}"] if wide else []),
             r"\begin{table}",
             r"  \centering",
-            f"  \\caption{{{escaped(table.title)}: {escaped(block.title)}}}\\label{{{label}}}",
+            f"  \\caption{{{latex_text(table.title)}: {latex_text(block.title)}}}\\label{{{label}}}",
             r"  \begin{adjustbox}{max totalsize={\linewidth}{0.9\textheight}}",
             f"  \\begin{{tabular}}{{l{'r' * len(single.columns)}}}",
             r"    \toprule",
@@ -120,10 +127,10 @@ def latex(table: Table) -> str:
         ]
         for title, cells in rows_of(single):
             shown = (LATEX_COMMANDS.get(rank, r"\underline{{{}}}").format(_number(text)) for text, rank in cells)
-            lines.append(_line([escaped(title), *shown]))
+            lines.append(_line([latex_text(title), *shown]))
         lines += [r"    \bottomrule", r"  \end{tabular}", r"  \end{adjustbox}", r"\end{table}"]
         lines += [r"\end{landscape}"] if wide else [r"\clearpage"]
-    notes = (f"\\noindent {escaped(note)}\\par" for note in table.notes)
+    notes = (f"\\noindent {latex_text(note)}\\par" for note in table.notes)
     return "\n".join([*lines, r"\begingroup\footnotesize", *notes, r"\endgroup"]) + "\n"
 
 
@@ -141,10 +148,10 @@ def csv_text(table: Table) -> str:
     return DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n")
 
 
-def escaped(words: str) -> str:
+def latex_text(words: str) -> str:
     """Return text that LaTeX prints as it is.
 
-    >>> escaped("50 % of a_b ↑")
+    >>> latex_text("50 % of a_b ↑")
     '50 \\\\% of a\\\\_b $\\\\uparrow$'
     """
     return "".join(SPECIAL.get(character, character) for character in words)
@@ -156,17 +163,17 @@ def _headings(table: Table) -> list[str]:
     if any(group for group, _ in groups):
         cells, rules = [""], ""
         for group, size in groups:
-            cells.append(f"\\multicolumn{{{size}}}{{c}}{{{escaped(group)}}}")
+            cells.append(f"\\multicolumn{{{size}}}{{c}}{{{latex_text(group)}}}")
             rules += f"\\cmidrule(lr){{{first}-{first + size - 1}}}" if group else ""
             first += size
         lines += [_line(cells), f"    {rules}"]
-    return [*lines, _line([escaped(table.corner), *(escaped(column.heading) for column in table.columns)])]
+    return [*lines, _line([latex_text(table.corner), *(latex_text(column.heading) for column in table.columns)])]
 
 
 def _number(shown: str) -> str:
     mean, plus_minus, spread = shown.partition(" ± ")
-    text = f"${mean[0]}${mean[1:]}" if mean[:1] in ("+", "-") else escaped(mean)
-    return f"{text}{{\\tiny\\,$\\pm$\\,{escaped(spread)}}}" if plus_minus else text
+    text = f"${mean[0]}${mean[1:]}" if mean[:1] in ("+", "-") else latex_text(mean)
+    return f"{text}{{\\tiny\\,$\\pm$\\,{latex_text(spread)}}}" if plus_minus else text
 
 
 def _line(cells: list[str]) -> str:

@@ -100,7 +100,7 @@ def test_missing_and_unknown_keys_are_listed(result, tmp_path):
         ({"config": []}, "config is ..; it must be dict"),
         ({"iterations": True}, "iterations is True"),
         ({"timing": 3}, "timing|items"),
-        ({"timing": {"train_seconds": 10**400}}, "int too large"),
+        ({"timing": {"train_seconds": 10**400}}, "no number of a result"),
         ({"timing": {"train_seconds": -1.0}}, "timing.train_seconds is -1.0; it must be a time, at least 0"),
         ({"iterations_done": -5}, "iterations_done is -5; it must be at least 0"),
         ({"reason": "\ud800"}, "surrogates not allowed"),
@@ -124,7 +124,7 @@ def test_files_from_elsewhere_hold_names_and_numbers_where_they_should(result, t
 def test_a_bare_nan_leaves_its_file_out(result, tmp_path):
     path = results.write(result, tmp_path)
     path.write_text(path.read_text().replace("24.25", "NaN"))
-    with pytest.raises(ResultError, match=r"result.json: .*not JSON compliant"):
+    with pytest.raises(ResultError, match=r"result.json: NaN is no number of a result"):
         results.read(path)
 
 

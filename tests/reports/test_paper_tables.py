@@ -8,7 +8,7 @@ import pytest
 from support.made_up import RULES, builder, data_set, failed, result, run_set
 
 from padgs.reports.table import MISSING, ReportError, Table
-from padgs.reports.writers import csv_text, markdown
+from padgs.reports.writers import csv_text, latex, markdown
 from padgs.results import Scores
 
 table1, table2, table3, table4 = map(builder, ("table1", "table2", "table3", "table4"))
@@ -47,19 +47,106 @@ def ablation(results, **request) -> list[list[str]]:
     return block(markdown(table3(run_set(results, **request))), "360Roam, bar")
 
 
-def test_published_numbers_stand_beside_ours_with_the_difference():
-    rows = block(markdown(table1(run_set([result("", psnr=23.5, ssim=0.81, lpips=0.229)]))), "360Roam, bar")
-    assert rows[-1][:7] == ["PaD-GS", "0.810", "0.808", "+0.002", "23.50", "23.40", "+0.10"]
-    omnigs = next(row for row in rows if row[0] == "OmniGS")
-    assert omnigs[:4] == ["OmniGS", MISSING, "0.783", MISSING]
+def repeated(results):
+    return [replace(one, seed=seed, run=f"{one.run}{seed}") for one in results for seed in range(3)]
+
+
+def across(results, metric="PSNR", build=table1) -> dict[str, dict[str, str]]:
+    """Row -> method -> cell of a block with scenes down and methods across."""
+    body = markdown(build(run_set(results))).split(f"### {metric}")[1].split("\n\n### ")[0]
+    heads, _, *rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in body.splitlines() if line[:1] == "|"
+    ]
+    return {row[0]: dict(zip(heads[1:], row[1:], strict=True)) for row in rows}
+
+
+def test_published_numbers_stand_below_ours_with_the_difference():
+    made = across([result("", psnr=23.5, ssim=0.81, lpips=0.229)])
+    assert {row: of["PaD-GS"] for row, of in made.items()} == {"bar": "23.50", "bar, paper": "23.40", "bar, Δ": "+0.10"}
+    assert {row: of["OmniGS"] for row, of in made.items()} == {"bar": MISSING, "bar, paper": "22.24", "bar, Δ": MISSING}
     #                               SSIM     paper    Δ         PSNR     paper    Δ        LPIPS    paper    Δ
     assert " ".join(ablation(FOUR)[0]) == "Baseline 0.786 0.786 +0.000 22.30 22.29 +0.01 0.257 0.257 +0.000"
 
 
+def test_the_layout_is_the_papers_and_the_best_is_sought_along_a_row():
+    made = across(repeated([result("", psnr=23.5), result("", method="omnigs", preset="omnigs", psnr=22.0)]))
+    assert list(made["bar (n=3)"]) == ["EgoNeRF", "OP43DGS", "ODGS", "OmniGS, corrected", "SPaGS", "PaD-GS"]
+    assert made["bar (n=3)"]["PaD-GS"].startswith("**23.50") and "<ins>22.00" in made["bar (n=3)"]["OmniGS, corrected"]
+    heads = [line for line in csv.DictReader(io.StringIO(csv_text(table1(run_set(repeated([result("")]))))))]
+    assert {"PaD-GS", "OmniGS"} <= {line["column"] for line in heads if line["block"].startswith("PSNR")}
+
+
+@pytest.mark.parametrize("other", [{"width": 512, "height": 256}, {"iterations": 7000}])
+def test_there_is_a_difference_at_the_size_and_length_of_the_paper_only(other):
+    assert "bar, Δ" not in across([result("", **other)])
+    both = across([result(""), result("", method="egonerf", preset="egonerf")])
+    assert both["bar, Δ"]["PaD-GS"] == "+0.10" and both["bar, Δ"]["EgoNeRF"] == MISSING, "published with 100 000"
+    seconds = result("", config={"budget": {"seconds": 60.0, "clock": "cpu"}})
+    assert "bar, Δ" not in across([seconds])
+    assert "Δ |" not in markdown(table3(run_set([result("full", **other)])))
+
+
 def test_failures_of_ours_and_of_the_paper():
     bricks = failed("", "oom", dataset="ricoh360", scene="bricks")
-    rows = {row[0]: row for row in block(markdown(table2(run_set([bricks]))), "Ricoh360, bricks")}
-    assert rows["PaD-GS"][1] == "OOM" and rows["OP43DGS"][2] == "OOM"
+    made = across([bricks], build=table2)
+    assert made["bricks"]["PaD-GS"] == "OOM" and made["bricks, paper"]["OP43DGS"] == "OOM"
+
+
+def test_the_average_is_over_the_scenes_that_were_run_for_the_paper_too():
+    some = [run for run in data_set("roam360") if run.scene in ("bar", "lab")]
+    title = "360Roam, average over 2 of its 11 scenes: bar, lab"
+    found = cells(table1(run_set(some)))
+    assert float(found[title, "PaD-GS", "PSNR", "PSNR"]["value"]) == pytest.approx((20.5 + 28.5) / 2)
+    assert float(found[title, "PaD-GS", "PSNR", "paper"]["value"]) == pytest.approx((23.40 + 29.45) / 2)
+    assert float(found[title, "PaD-GS", "PSNR", "Δ"]["value"]) == pytest.approx(24.5 - 26.425)
+    assert table1(run_set(some)).blocks[0].title == title and title in latex(table1(run_set(some)))
+    assert not any("average" in block.title for block in table1(run_set(some[:2])).blocks), "one scene"
+    bricks = [run for run in data_set("ricoh360") if run.scene in ("bricks", "farm")]
+    rows = {row[0]: row for row in block(markdown(table2(run_set(bricks))), "Ricoh360, average")}
+    assert set(rows["OP43DGS"][1:]) == {MISSING}, "out of memory"
+
+
+def test_any_scenes_have_a_mean_and_nothing_of_the_paper_unless_its_data_sets_were_run():
+    mine = [
+        replace(run, dataset="", scene=f"my_{run.scene}", config={**run.config, "data": {"path": run.scene}})
+        for run in data_set("roam360", seeds=2)
+        if run.scene in ("bar", "lab")
+    ]
+    table = table1(run_set(mine))
+    assert [block.title for block in table.blocks] == ["Average over 2 scenes: my_bar, my_lab", "my_bar", "my_lab"]
+    found = cells(table)["Average over 2 scenes: my_bar, my_lab", "PaD-GS", "PSNR", "PSNR"]
+    assert float(found["value"]) == pytest.approx(24.55) and found["n"] == "2"
+    for build in (table1, table2, table3, table4, builder("methods")):
+        text = markdown(build(run_set(mine)))
+        assert not any(word in text for word in ("paper ", "Δ", "360Roam", "Ricoh360", "3090", "of the paper"))
+    sizes = [*mine, *(replace(run, scene="wide", width=4096, height=2048, run=f"w{run.run}") for run in mine[:4])]
+    table = table1(run_set(sizes))
+    assert "No mean over the scenes: " in "".join(table.notes) and len(table.blocks) == 3
+
+
+def test_methods_and_scenes_are_chosen_by_names_and_patterns():
+    made = data_set("roam360", methods=("omnigs", "padgs", "odgs"))
+    made += [replace(made[0], dataset="", scene="my_room", run="mine")]
+
+    def shown(**request) -> tuple[set[str], set[str]]:
+        runs = run_set(made, **request).requested
+        return set(runs["scene"]), set(runs["preset"])
+
+    assert shown(scenes=("my-room",)) == ({"my_room"}, {"omnigs"})
+    assert shown(scenes=("lab", "c?nter*"))[0] == {"lab", "center", "center1"}
+    assert shown(scenes=("roam360",), methods=("o*",)) == (shown()[0] - {"my_room"}, {"omnigs", "odgs"})
+    assert shown(where={"scene": "bar", "method": "padgs"}) == ({"bar"}, {"padgs"})
+    with pytest.raises(ReportError, match="no run has scene attic; runs have bar, base"):
+        shown(scenes=("attic",))
+    with pytest.raises(ReportError, match="no run has method spags; runs have odgs, omnigs, padgs"):
+        shown(where={"method": "spags"})
+
+
+def test_columns_are_chosen_by_name():
+    table = table1(run_set(data_set("roam360"), metrics=("psnr", "frame_ms")))
+    assert [column.title for column in table.columns] == ["PSNR", "paper", "Δ", "ms per frame"]
+    with pytest.raises(ReportError, match="unknown metric 'pnsr'; known under protocol paper: psnr"):
+        table1(run_set(data_set("roam360"), metrics=("pnsr",)))
 
 
 def test_the_average_over_all_scenes():
@@ -80,28 +167,23 @@ def test_the_average_of_an_incomplete_column_is_missing():
     found = cells(table1(run_set(broken)))
     for method in ("OmniGS, corrected", "PaD-GS"):
         assert found["360Roam, average over its 11 scenes", method, "PSNR", "PSNR"]["value"] == ""
-    op43dgs = next(r for r in block(markdown(table2(run_set([]))), "Ricoh360, average") if r[0] == "OP43DGS")
-    assert set(op43dgs[1:]) == {MISSING}
 
 
 def test_other_scenes_have_blocks_of_their_own_with_their_origin():
     room = result("", dataset="synthetic", scene="synthetic-room")
     outdoor, capture = replace(room, scene="synthetic-outdoor"), replace(room, dataset="", scene="flat")
     indoor, outdoors = (markdown(build(run_set([room, outdoor, capture]))) for build in (table1, table2))
-    assert "### synthetic-room (built in, generated; no scene of the paper)" in indoor
-    assert "### flat (a capture that is no scene of the paper)" in indoor
+    assert "### synthetic-room (generated)" in indoor and "### flat\n" in indoor
     assert "synthetic-outdoor" in outdoors and "flat" not in outdoors and "synthetic-outdoor" not in indoor
-    assert "360Roam, not run: bar, base" in indoor
     parts = markdown(table3(run_set([replace(row, dataset="synthetic", scene="synthetic-room") for row in FOUR])))
     assert "### synthetic-room" in parts and "| Baseline | 0.786 | 22.30 | 0.257 |" in parts
 
 
-def test_presets_of_a_method_are_rows_of_their_own():
+def test_presets_of_a_method_stand_beside_each_other():
     runs = [result("", method="odgs", preset=preset) for preset in ("odgs", "odgs_release", "odgs_fast")]
-    rows = {row[0]: row for row in block(markdown(table1(run_set(runs))), "360Roam, bar")}
-    released = rows["ODGS, as released, gradients corrected"]
-    assert rows["ODGS, corrected"][5].strip("*") == released[5].strip("*") == "20.17"
-    assert rows["ODGS, fast"][5] == MISSING
+    published = across(runs)["bar, paper"]
+    assert published["ODGS, corrected"] == published["ODGS, as released, gradients corrected"] == "20.17"
+    assert published["ODGS, fast"] == MISSING
 
 
 def test_only_runs_of_the_tables_own_experiments_compete_where_there_are_any():
@@ -110,16 +192,16 @@ def test_only_runs_of_the_tables_own_experiments_compete_where_there_are_any():
     other_tau = result("", psnr=8.0, experiments=("tau@cpu",), config={"method": {"tau": 0.5}})
     for build in (table1, table4):
         build(run_set([own, trial, other_tau]))
-    assert block(markdown(table1(run_set([own, trial, other_tau]))), "360Roam, bar")[-1][4] == "23.50"
+    assert across([own, trial, other_tau])["bar"]["PaD-GS"] == "23.50"
     with pytest.raises(ReportError, match="differ in length"):
         table1(run_set([replace(r, experiments=()) for r in (own, trial)]))
-    assert block(markdown(table1(run_set([own, trial], experiment="smoke"))), "360Roam, bar")[-1][4] == "9.00"
+    assert "9.00" in markdown(table1(run_set([own, trial], experiment="smoke")))
 
 
 def test_scenes_without_an_experiment_of_the_table_show_ad_hoc_runs():
     own = result("", experiments=("table1_360roam",))
     room = [result("", dataset="", scene="room"), result("", dataset="", scene="room", psnr=9.0, experiments=("tau",))]
-    assert block(markdown(table1(run_set([own, *room]))), "room (a capture")[0][2] == "23.50"
+    assert block(markdown(table1(run_set([own, *room]))), "room")[0][2] == "23.50"
 
 
 def test_rows_of_an_ablation_are_not_methods():
@@ -188,10 +270,6 @@ def test_footnotes_name_the_conditions(build, made):
     assert "seeds 0" in note and ("RTX 3090" in text)
 
 
-def repeated(results):
-    return [replace(one, seed=seed, run=f"{one.run}{seed}") for one in results for seed in range(3)]
-
-
 def test_the_best_of_each_column_is_bold_by_its_own_direction():
     rows = ablation(repeated(FOUR))
     bold = [[index for index, row in enumerate(rows) if row[column].startswith("**")] for column in (1, 4, 7)]
@@ -209,8 +287,7 @@ def test_missing_and_failed_cells():
     rows = ablation([failed("baseline", "oom"), result("full", lpips=None)])
     assert rows[0][1::3] == ["OOM"] * 3 and rows[1][1::3] == [MISSING] * 3
     assert rows[3][7] == MISSING and rows[3][4] == "23.50"
-    text = markdown(table3(run_set([])))
-    assert "24.92" in text and "Ricoh360, cat\\_tower: not run" in text, "published numbers remain"
+    assert table3(run_set([])).blocks == ()
 
 
 def test_seeds_are_averaged_with_their_deviation():
@@ -267,4 +344,4 @@ def test_spherical_metrics_are_not_put_beside_published_ones():
     metrics = {"ws_psnr": 25.0, "ws_ssim": 0.8, "ws_lpips_alex": 0.2}
     sphere = replace(result("full"), scores={"sphere": Scores(RULES, metrics, {})})
     text = markdown(table3(run_set([sphere], protocol="sphere")))
-    assert "| + DAGD + DAOM + M | 0.800 | 25.00 | 0.200 |" in text and "paper" not in text.split("- 360Roam")[0]
+    assert "| + DAGD + DAOM + M | 0.800 | 25.00 | 0.200 |" in text and "| paper" not in text

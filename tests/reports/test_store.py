@@ -10,6 +10,8 @@ from padgs.cli.commands import app
 from padgs.reports import store
 from padgs.results import ResultError
 
+LOCK = ".results.jsonl.lock"
+
 
 def report(*arguments, code: int = 0):
     done = CliRunner().invoke(app, ["report", *map(str, arguments)])
@@ -85,7 +87,7 @@ def test_a_run_that_is_collected_from_two_folders_keeps_its_experiments(tmp_path
 def test_collected_runs_give_the_same_reports(runs, tmp_path):
     out = tmp_path / "measured"
     report("table1", runs, "--out", out, "--collect")
-    assert {path.name for path in out.iterdir()} == {"table1.md", "table1.tex", "table1.csv", store.FILE_NAME}
+    assert {path.name for path in out.iterdir()} == {"table1.md", "table1.tex", "table1.csv", store.FILE_NAME, LOCK}
     report("table1", out / store.FILE_NAME, "--out", tmp_path / "again")
     report("chart", out / store.FILE_NAME)  # beside the store where no other place is named
     report("chart", runs, "--out", tmp_path / "again")
@@ -112,6 +114,6 @@ def test_a_damaged_line_is_named_and_left_out_and_strict_fails(runs, tmp_path):
         assert any(f"store.jsonl:{number}" in line and reason in line for line in done.output.splitlines())
     assert report("runs", path)
     before = path.read_bytes()
-    with pytest.raises(ResultError, match="store.jsonl:1 was edited"):
+    with pytest.raises(ResultError, match="store.jsonl:1 .* was edited"):
         store.add([], path)
     assert path.read_bytes() == before, "what was damaged may be mended; it is not thrown away"

@@ -32,7 +32,7 @@ def test_it_needs_nothing_from_outside(html):
 
 
 def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
-    for words in ("Table 4", "Sweep tau@cpu", "synthetic-room (built in", "runs/x/result.json was edited"):
+    for words in ("Table 4", "Sweep tau@cpu", "synthetic-room (generated", "runs/x/result.json was edited"):
         assert words in html
     assert "26.02" not in html, "numbers of the paper where nothing of ours stands beside them"
     assert html.count('<figure class="chart"') == 3 and html.count('class="tip"><title>') > 40
@@ -74,7 +74,7 @@ def test_the_number_of_files_is_bounded(runs, monkeypatch):
     monkeypatch.setattr(page, "MAX_FILES", 6)
     assert [len(scene["views"]) for scene in page.album(RunSet(runs)).scenes] == [1]
     monkeypatch.setattr(page, "MAX_FILES", 5)
-    assert page.album(RunSet(runs)).left_out == ["synthetic-room (built in, generated; no scene of the paper)"]
+    assert page.album(RunSet(runs)).left_out == ["synthetic-room (generated)"]
 
 
 def test_an_incomplete_file_is_left_out(tmp_path):
