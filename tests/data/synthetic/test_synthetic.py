@@ -5,6 +5,7 @@ import os
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from padgs.data import DataError, DataOptions
 from padgs.data.synthetic import SCENES, SyntheticOptions, SyntheticTruth, cache, camera, generate, load
@@ -62,6 +63,21 @@ def test_a_damaged_cache_is_regenerated(tmp_path):
     next(tmp_path.rglob("000003.png")).unlink()
     same(first, generate(options))
     assert cache.read(options) is not None
+
+
+def test_a_changed_picture_or_point_in_the_cache_is_not_believed(tmp_path):
+    options = SyntheticOptions(**TINY)
+    first = generate(options)
+    pixels = first.train[1].load_pixels().numpy()
+    Image.fromarray(255 - pixels).save(next(tmp_path.rglob("000002.png")))
+    assert cache.read(options) is None
+    same(first, generate(options))
+    table = next(tmp_path.rglob("scene.npz"))
+    arrays = dict(np.load(table)) | {"points": np.zeros((300, 3))}
+    np.savez_compressed(table, **arrays)
+    same(first, generate(options))
+    next(tmp_path.rglob("scene.npz")).with_name("sha256").unlink()
+    same(first, generate(options))
 
 
 def test_scenes_generate_without_a_writable_cache(tmp_path, monkeypatch):
