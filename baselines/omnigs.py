@@ -10,4 +10,6 @@ from padgs.methods.splats.method import SplatMethod
 
 
 class OmniGSMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
+    """See `padgs.training.method.Method`. Fast learning rates cost it quality in longer runs (docs/methods.md)."""
+
+    RUN_RATES = "run_linear"

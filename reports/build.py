@@ -5,13 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from pandas import DataFrame
 
 from padgs.reports import REPORTS, methods, published
 from padgs.reports.conditions import Reason, as_published, footnotes, refuse_mixture, unranked, unranked_notes
-from padgs.reports.frame import CONFIG, LARGEST_FACTOR, PUBLISHED_ITERATIONS, by_conditions, by_place, grouped, law
+from padgs.reports.frame import (
+    CONFIG,
+    LARGEST_FACTOR,
+    LINEAR,
+    LINEAR_ITERATIONS,
+    PUBLISHED_ITERATIONS,
+    by_conditions,
+    by_place,
+    grouped,
+    law,
+)
 from padgs.reports.measures import Measure, quantity
 from padgs.reports.published import AVERAGE, Place, Published
 from padgs.reports.selection import Mixture, RunSet, experiment_of, one_setting, refuse_differences, settings
@@ -280,7 +291,8 @@ class _Pivot(_Builder):
             factors = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
             notes.append(
                 f"The law, √({PUBLISHED_ITERATIONS} / iterations) and at most {LARGEST_FACTOR:g}, gives {factors} "
-                "iterations. Its loss is the difference, seed by seed, of the factor nearest to it (by their ratio) "
+                f"iterations; for {', '.join(map(methods.name, LINEAR))} it is {LINEAR_ITERATIONS} / iterations. Its "
+                "loss is the difference, seed by seed, of the factor nearest to it (by their ratio) "
                 "from the one with the best mean."
             )
         columns = tuple(Column(heading, 2, measure.column.higher_is_better) for heading in headings)
@@ -304,14 +316,14 @@ class _Pivot(_Builder):
             rows = (Row(f"× {f:g}", tuple(cells[f].get(key, (Cell(),))[0] for key in keys)) for f in sorted(cells))
             blocks.append(Block(where, tuple(rows)))
             of_lengths = ({factor: of[key] for factor, of in cells.items() if key in of} for key in keys)
-            losses.append(Row(methods.title(preset), tuple(map(self._loss, keys, of_lengths))))
+            losses.append(Row(methods.title(preset), tuple(map(partial(self._loss, preset), keys, of_lengths))))
         return [*blocks, Block(f"What the law loses, {title}", tuple(losses), signed=True)]
 
-    def _loss(self, key: tuple[int], factors: Mapping[float, tuple[Cell, DataFrame]]) -> Cell:
+    def _loss(self, preset: str, key: tuple[int], factors: Mapping[float, tuple[Cell, DataFrame]]) -> Cell:
         means = {factor: cell.value for factor, (cell, _) in factors.items() if cell.value is not None}
         if not means:
             return Cell()
-        near = min(means, key=lambda factor: abs(math.log(factor / law(key[0]))))
+        near = min(means, key=lambda factor: abs(math.log(factor / law(key[0], methods.method_of(preset)))))
         best = max(means, key=lambda factor: means[factor])
         column = self.measures[0].name
         ours, others = (factors[f][1].query("ok").set_index("seed")[column].astype(float) for f in (near, best))

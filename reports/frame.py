@@ -26,6 +26,7 @@ CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
+LINEAR, LINEAR_ITERATIONS = ("omnigs",), 3000  # methods with a law of their own for learning rates
 LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.targets`, without torch
 
 
@@ -90,15 +91,18 @@ def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
     return found
 
 
-def law(iterations: int) -> float:
+def law(iterations: int, method: str = "") -> float:
     """Return the factor that `train.learning_rates=run` chooses: √(30 000 / iterations), in [1, 8].
+
+    For `LINEAR` methods it is 3000 / iterations, in the same limits.
 
     A copy without torch; a test compares it with the one that trains.
 
     >>> law(30_000), law(7500), law(100)
     (1.0, 2.0, 8.0)
     """
-    return min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), LARGEST_FACTOR)
+    factor = LINEAR_ITERATIONS / iterations if method in LINEAR else math.sqrt(PUBLISHED_ITERATIONS / iterations)
+    return min(max(factor, 1.0), LARGEST_FACTOR)
 
 
 def images_seen(result: Result) -> float | None:
@@ -193,7 +197,7 @@ def _factor(result: Result) -> float | None:
     choice = result.config.get("train", {}).get("learning_rates", "published")
     if not result.iterations:
         return None
-    return 1.0 if choice == "published" else law(result.iterations) if choice == "run" else float(choice)
+    return 1.0 if choice == "published" else law(result.iterations, result.method) if choice == "run" else float(choice)
 
 
 def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -200,7 +200,7 @@ class Search:
         train = replace(
             config.train,
             iterations=max(views, round(REFINED * schedule)),
-            learning_rates=Pace.of(config.train.learning_rates, schedule).factor,
+            learning_rates=Pace.of(self.run.method.train_options.learning_rates, schedule).factor,
             refine=True,
             hold_out=hold_out,
             max_seconds=None,

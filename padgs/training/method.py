@@ -39,6 +39,7 @@ class Method(ABC):
     CUT_FINENESS: ClassVar[float] = 1.0  # pixels of a perspective view are taken to be so much finer than a panorama's
     RENDER: ClassVar[RenderConfig] = RenderConfig()
     TRAIN: ClassVar[TrainOptions] = TrainOptions()
+    RUN_RATES: ClassVar[str] = "run"  # law that `train.learning_rates=run` stands for
 
     def __init__(
         self,
@@ -50,6 +51,8 @@ class Method(ABC):
         """Check the options; those that can train on no scene are a ValueError."""
         self.options, self.seed = options or self.Options(), seed
         self.render_config, self.train_options = render or self.RENDER, train or self.TRAIN
+        if self.train_options.learning_rates == "run":
+            self.train_options = replace(self.train_options, learning_rates=self.RUN_RATES)
         self._model: Model | None = None
         self._trainer: Trainer | None = None
         self._camera: CameraMap | None = None  # that took all photographs, if it is learned

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from torch import nn
 
 PUBLISHED_ITERATIONS = 30_000  # length of all published schedules
-LEARNING_RATES = ("published", "run")
+LEARNING_RATES = ("published", "run", "run_linear")
 FASTEST = 8.0  # largest factor on published rates; 9 lost quality in runs of 500 iterations
+LINEAR_ITERATIONS = 3000  # shorter runs have faster rates by run_linear
 SLOWING_FROM = 0.6  # share of the run after which faster rates fall back to the published ones
 
 
@@ -68,9 +69,12 @@ class Pace:
     Adam moves a parameter by about its learning rate in a step, so parameters move less in a run with fewer steps.
     Random steps cover distances that grow with the square root of their number; the factor that fits a run is the
     square root of published over actual length, at most `FASTEST`. From `SLOWING_FROM` on it falls log-linearly to 1,
-    so that models settle as they do at published rates. At the published length it is 1.
+    so that models settle as they do at published rates. At the published length it is 1. OmniGS wants less of it in
+    longer runs: `LINEAR_ITERATIONS` over the actual length (docs/methods.md).
 
     >>> Pace.of("run", 30_000).factor, Pace.of("run", 7500).factor, Pace.of("run", 60).factor
+    (1.0, 2.0, 8.0)
+    >>> Pace.of("run_linear", 6400).factor, Pace.of("run_linear", 1500).factor, Pace.of("run_linear", 60).factor
     (1.0, 2.0, 8.0)
     >>> pace = Pace.of(4.0, iterations=1000)
     >>> [round(pace(iteration), 9) for iteration in (600, 800, 1000)]
@@ -82,12 +86,14 @@ class Pace:
 
     @classmethod
     def of(cls, choice: str | float, iterations: int, schedule: int | None = None) -> Pace:
-        """Return the pace of a run of `iterations`: `published`, `run` for the factor that fits, or a factor.
+        """Return the pace of a run of `iterations`: `published`, `run` or `run_linear`, or a factor.
 
         A `schedule` that follows a clock has more steps than the run has iterations; None: as many.
         """
-        if choice == "run":
-            choice = min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), FASTEST)
+        if choice in ("run", "run_linear"):
+            is_linear = choice == "run_linear"
+            factor = LINEAR_ITERATIONS / iterations if is_linear else math.sqrt(PUBLISHED_ITERATIONS / iterations)
+            choice = min(max(factor, 1.0), FASTEST)
         return cls(1.0 if choice == "published" else float(choice), schedule or iterations)
 
     def __call__(self, iteration: int) -> float:

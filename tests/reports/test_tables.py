@@ -7,6 +7,8 @@ import pytest
 from omegaconf import OmegaConf
 from support.made_up import RULES, builder, compared, failed, of_experiment, result, run_set, small
 
+from padgs.baselines import BUILT_IN, METHODS
+from padgs.registry import lookup
 from padgs.reports.frame import law
 from padgs.reports.methods import title
 from padgs.reports.significance import BEST, SECOND, emphasis
@@ -327,7 +329,10 @@ def test_lengths_and_rates_are_columns():
 
 @pytest.mark.parametrize(
     ("best", "losses"),
-    [(lambda n: min((1, 2, 4, 8), key=lambda f: abs(math.log(f / law(n)))), (0, 0, 0)), (lambda n: 2, (-2, -1, 0))],
+    [
+        (lambda n: min((1, 2, 4, 8), key=lambda f: abs(math.log(f / law(n, "omnigs")))), (0, 0, 0)),
+        (lambda n: 2, (-2, 0, -1)),
+    ],
 )
 def test_the_law_loses_the_distance_of_its_factor_from_the_best(best, losses):
     table = learning_rates(run_set(scaled(best)))
@@ -349,6 +354,8 @@ def test_a_run_that_failed_before_its_first_iteration_has_no_length():
 @pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])
 def test_the_law_is_that_of_training(iterations):
     assert law(iterations) == Pace.of("run", iterations).factor
+    for name in BUILT_IN:
+        assert law(iterations, name) == Pace.of(lookup(METHODS, name, "method").RUN_RATES, iterations).factor, name
 
 
 def test_voxels_are_crossed_with_modulation_and_the_paper_may_score_without_the_bottom():
