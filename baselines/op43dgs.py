@@ -62,6 +62,7 @@ class OP43DGSMethod(SplatMethod):
     Options = OP43DGSOptions
     MODEL = OP43DGSModel
     RENDER = RenderConfig(projection="tangent")
+    RUN_RATES = "run_linear"
 
     @property
     def has_smoothing_filter(self) -> bool:

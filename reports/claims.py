@@ -319,6 +319,6 @@ A claim *holds* if p is below {1 - CONFIDENCE:.2g} and every scene is on its sid
 scene* if scenes disagree, and is *undecided* without significance. Claims of the paper are judged against the paper's
 methods as published.
 
-All methods train with learning rates that fit the length of a run (`train.learning_rates=run`), OmniGS by a law of its
-own ([table](../reports/measured/learning_rates.md)); those of ODGS and OP43DGS were not measured.
+All methods train with learning rates that fit the length of a run (`train.learning_rates=run`), OmniGS and OP43DGS by
+a law of their own ([table](../reports/measured/learning_rates.md)); ODGS was not measured.
 """
