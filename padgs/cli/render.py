@@ -39,6 +39,7 @@ def render(
     if camera == "panorama" and (fov is not None or height is not None):
         raise ValueError("--fov and --height belong to perspective images: add --camera perspective")
     check_range(0.01, 1000, fps=fps)
+    check_range(0.1, 179.9, fov=fov)
     check_range(2, MAX_SIDE, width=width or None)
     check_range(1, MAX_SIDE, height=height)
     if seconds is not None and not 0 < seconds * fps <= MAX_FRAMES:

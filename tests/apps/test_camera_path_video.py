@@ -135,7 +135,10 @@ def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
         ),
         (("--height", "9"), "belong to perspective images: add --camera perspective"),
         (("--path", "spiral"), "the path spiral does not exist; known: cameras, orbit, dolly"),
-        (("--camera", "perspective", "--fov", "180"), "and 180 degrees is impossible"),
+        *(
+            (("--camera", "perspective", "--fov", value), f"--fov is {float(value)}; it must be from 0.1 to 179.9")
+            for value in ("180", "1e-300", *BAD_NUMBERS)
+        ),
     ],
 )
 def test_invalid_options_are_refused(arguments, message, folder, tmp_path):
