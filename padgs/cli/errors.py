@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from padgs.checks import printable
 from padgs.runs.interrupt import ending_by_signals
 
 Run = Annotated[str, typer.Argument(help="folder of a run, finished or not, as padgs-run names it at its end")]
-MAX_SEED, MAX_THREADS = 2**32 - 1, 1024
+MAX_SEED, MAX_THREADS = 2**32 - 1, max(64, 4 * (os.cpu_count() or 1))
 DataPath = Annotated[str | None, typer.Option("--data", help="new place of its data set, if it has moved")]
 
 

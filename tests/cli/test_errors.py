@@ -6,17 +6,17 @@ import pytest
 from typer.testing import CliRunner
 
 from padgs.cli.commands import app
-from padgs.cli.errors import without_traceback
+from padgs.cli.errors import MAX_THREADS, without_traceback
 
 TOO_LARGE = str(10**40)
 NUMBERS = {
-    "bench --threads": "0 to 1024",
+    "bench --threads": f"0 to {MAX_THREADS}",
     "bench --repeats": "0 to 10000",
     "bench --seed": "0 to 4294967295",
     "convert SOURCE OUT --to colmap --width": "0 to 65536",
     "export RUN --distillation-steps": "0 to 100000",
     "prepare SOURCE OUT --seed": "0 to 4294967295",
-    "prepare SOURCE OUT --threads": "0 to 1024",
+    "prepare SOURCE OUT --threads": f"0 to {MAX_THREADS}",
     "view RUN --port": "1 to 65535",
 }
 NOT_WHOLE = ("nan", "inf", "1e30", "x")
