@@ -54,13 +54,43 @@ def test_names_of_built_in_methods_are_refused(installed, monkeypatch):
     assert clash() == "entry point my_method:MyMethod has the name my_method of a built-in method; rename it"
 
 
-def test_methods_that_fail_to_import_are_skipped_with_one_warning(monkeypatch, capsys):
-    monkeypatch.setitem(METHODS, "broken", "no_such_module:Method")
+BROKEN = {
+    "no_such_module:Method": "ModuleNotFoundError: No module named 'no_such_module'",
+    "ends:Method": "SystemExit: 3",
+    "raises:Method": "ZeroDivisionError: division by zero",
+    "empty:Method": "AttributeError: module 'empty' has no attribute 'Method'",
+    "options:Method": "SystemExit: 4",
+}
+
+
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    """Modules that end the program, or raise, when they are imported or asked for their options."""
+    (tmp_path / "ends.py").write_text("import sys; sys.exit(3)")
+    (tmp_path / "raises.py").write_text("1 / 0")
+    (tmp_path / "empty.py").write_text("")
+    (tmp_path / "options.py").write_text("import sys\nclass Method:\n    def Options(): sys.exit(4)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    for name in ("ends", "raises", "empty", "options"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("place", BROKEN)
+def test_methods_that_fail_are_skipped_with_one_warning(broken, place, monkeypatch, capsys):
+    monkeypatch.setitem(METHODS, "broken", place)
     for _ in range(2):
         register_choices()
     said = capsys.readouterr().err
-    assert said.count("method=broken is left out (ModuleNotFoundError: No module named 'no_such_module'") == 1
+    assert said.count("method=broken is left out (") == 1 and BROKEN[place] in said
     assert "broken" not in METHODS
+
+
+@pytest.mark.parametrize("place", [place for place in BROKEN if not place.startswith("options")])
+def test_runs_of_methods_that_fail_say_so_by_name(broken, place, monkeypatch):
+    monkeypatch.setitem(METHODS, "broken", place)
+    with pytest.raises(ValueError, match=f"method broken cannot be used: {place} of another package fails"):
+        config_from_values({"method": {"name": "broken"}, "protocol": {"paper": {}}})
 
 
 def test_results_say_which_package_they_are_of(installed):

@@ -168,7 +168,7 @@ def test_a_pipe_in_place_of_a_result_does_not_hang(tmp_path):
         (tmp_path / name[:3]).mkdir()
         os.mkfifo(tmp_path / name[:3] / name)
     found, broken = store.read(tmp_path)
-    assert len(found) == 1 and "res/result.json is no regular file" in str(broken[0])
+    assert len(found) == 1 and "res/result.json: it is no regular file" in str(broken[0])
 
 
 def test_a_picture_that_cannot_be_read_is_left_out_by_name(tmp_path):
