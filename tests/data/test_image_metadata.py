@@ -173,6 +173,20 @@ def test_several_pictures_are_refused(extension, tmp_path):
         inspect(tmp_path / f"a.{extension}")
 
 
+@pytest.mark.parametrize(("kind", "refused"), [(0x030000, False), (0x020002, True), (0x020003, True)])
+def test_pictures_of_two_eyes_in_a_jpeg_are_refused_but_not_previews(kind, refused, tmp_path):
+    PANORAMA.save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[PANORAMA.resize((32, 16))])
+    data = (tmp_path / "a.jpg").read_bytes()
+    primary = struct.pack("<II", 0x030000, data.index(b"\xff\xd9\xff\xd8") + 2)  # type and size
+    assert data.count(primary) == 1
+    (tmp_path / "a.jpg").write_bytes(data.replace(primary, struct.pack("<I", kind) + primary[4:]))
+    if refused:
+        with pytest.raises(DataError, match="a.jpg holds 2 pictures"):
+            inspect(tmp_path / "a.jpg")
+    else:
+        assert decode(tmp_path / "a.jpg").shape == (64, 128, 3)
+
+
 @pytest.mark.parametrize("kind", ["palette", "colour key", "grey mask"])
 def test_transparency_without_an_alpha_channel_is_refused(kind, tmp_path):
     image = PANORAMA.quantize(16) if kind == "palette" else PANORAMA.convert("L") if "mask" in kind else PANORAMA
