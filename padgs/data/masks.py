@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from unicodedata import normalize
 
 import torch
 from torch import Tensor
@@ -188,7 +189,8 @@ def _in_folder(folder: Path, name: str, beside_images: bool) -> Path | None:
     stem = PurePosixPath(name).with_suffix("")
     candidates = [f"{name}.png", *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
     candidates = [*([] if beside_images else candidates), *(f"{stem}_mask{extension}" for extension in EXTENSIONS)]
-    return next((folder / file for file in candidates if (folder / file).is_file()), None)
+    forms = (folder / normalize(form, file) for file in candidates for form in ("NFC", "NFD"))
+    return next((file for file in (*(folder / file for file in candidates), *forms) if file.is_file()), None)
 
 
 def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:

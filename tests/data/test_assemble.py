@@ -201,7 +201,11 @@ def test_unicode_forms_of_names(folder: Path) -> None:
         path.rename(path.with_name(path.name.replace("pano", decomposed)))
     for file in ("sparse/0/images.txt", "train.txt", "test.txt"):
         (folder / file).write_text((folder / file).read_text().replace("pano", composed), encoding="utf-8")
-    assert [view.name for view in load(folder).test] == [f"{decomposed}_01", f"{decomposed}_04"]
+    (folder / "masks").mkdir()
+    Image.new("L", (64, 32), 200).save(folder / "masks" / f"{composed}_01.png")
+    scene = load(folder)
+    assert [view.name for view in scene.test] == [f"{decomposed}_01", f"{decomposed}_04"]
+    assert scene.test[0].mask() is not None
 
 
 def test_two_files_for_one_name_are_not_chosen_from(transforms: Path) -> None:
