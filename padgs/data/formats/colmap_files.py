@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import color_bytes, whole_if_possible
+from padgs.data.formats.poses import FARTHEST
 from padgs.data.images import read_bytes
 from padgs.data.splits import read_lines
 
@@ -152,7 +153,7 @@ def read_frames(model: Path) -> tuple[list[str], dict[int, NDArray[np.float64]]]
 
     def matrix(pose: Sequence[float]) -> NDArray[np.float64]:
         found = np.eye(4)
-        if np.isfinite(pose).all() and np.linalg.norm(pose[:4]) > 0.5:
+        if 0.4 < np.abs(pose[:4]).max() < 2 and np.abs(pose).max() < FARTHEST:  # else it agrees with no image
             found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), pose[4:]
         return found
 

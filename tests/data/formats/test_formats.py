@@ -1,6 +1,7 @@
 """Readers of all formats, on files written by hand: exact poses, points, colours, split and images."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,22 @@ def test_pairs_of_transforms_files(world: World, tmp_path: Path) -> None:
     (tmp_path / "scene" / "transforms.json").unlink()
     scene = load(tmp_path / "scene")
     assert [view.name for view in scene.test] == list(world.test) and len(scene.points) == len(world.points)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_byte_order_marks(encoding: str, world: World, tmp_path: Path) -> None:
+    _written(world, tmp_path)
+    file = tmp_path / "scene" / "transforms.json"
+    file.write_text(file.read_text(), encoding=encoding)
+    assert len(read(tmp_path / "scene").frames) == 6
+
+
+def test_pipes_in_place_of_files(world: World, tmp_path: Path) -> None:
+    _written(world, tmp_path)
+    (tmp_path / "scene" / "transforms.json").unlink()
+    os.mkfifo(tmp_path / "scene" / "transforms.json")
+    with pytest.raises(DataError, match="transforms.json cannot be read: it is no regular file"):
+        load(tmp_path / "scene")
 
 
 def test_masks_named_in_transforms(world: World, tmp_path: Path) -> None:
