@@ -10,8 +10,9 @@ views, so held-out views have the mean exposure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -201,8 +202,11 @@ class Corrections(nn.Module):
         groups += [] if self.poses is None else self.poses.groups(self._options.poses, iterations)
         return groups + ([] if self.lens is None else self.lens.groups(iterations))
 
-    def draw(self, model: Model, view: View) -> TrainingRender:
-        """Render a training view at its corrected pose and through its lenses; differentiable."""
+    def renderer(self, model: Model) -> Callable[[View], TrainingRender]:
+        """Return a function that renders a training view at its corrected pose and through its lenses."""
+        return model.draw if self.poses is None and self.lens is None else partial(self._draw, model)
+
+    def _draw(self, model: Model, view: View) -> TrainingRender:
         view = view if self.poses is None else self.poses.refined(view)
         if isinstance(self.lens, DualLens):
             return self.lens.draw(model.draw, view)

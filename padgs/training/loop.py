@@ -137,7 +137,7 @@ class Trainer:
             with stage("target"):
                 index, view, target = self._views.next(step / self.schedule)
             with stage("draw"):
-                rendered = self.corrections.draw(model, view)
+                rendered = self.corrections.renderer(model)(view)
                 image = self.corrections.exposed(rendered.rendering.image, index)
             if len(rendered.gaussians) == 0:
                 optimizer.refuse_non_finite(optimizer.parameters(), iteration)  # NaN parameters draw nothing either
