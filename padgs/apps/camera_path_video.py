@@ -22,6 +22,7 @@ from torch import Tensor
 
 from padgs.checks import install_command
 from padgs.data.camera_paths import PATHS, gravity
+from padgs.data.capture import DataError
 from padgs.data.formats.path_file import read_path
 from padgs.data.formats.transforms import transforms_file
 from padgs.evaluation.images import depth_image, to_uint8
@@ -73,7 +74,10 @@ def views_along(
     else:
         up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
         data_set = run.config.data
-        poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))
+        try:
+            poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))
+        except DataError as error:  # which would be taken for one of the run's data
+            raise ValueError(str(error)) from error
         poses = move_origin(poses, scene.origin)
     return [
         View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)

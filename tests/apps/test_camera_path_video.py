@@ -159,6 +159,8 @@ def test_errors_name_the_option_for_output_and_data(folder, tmp_path):
     (tmp_path / "a.mp4").mkdir()
     result = render(str(folder), "--to", str(tmp_path / "a.mp4"), "--seconds", "0.1", "--fps", "20")
     assert result.exit_code == 1 and "a.mp4: Is a directory; name another place with --to" in result.stderr
+    result = render(str(folder), "--path", "/dev/zero", "--to", str(tmp_path / "f"))
+    assert result.exit_code == 1 and "/dev/zero" in result.stderr and "--data" not in result.stderr
     result = render(str(folder), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "f"))
     assert result.exit_code == 1 and f"it is the data of {folder}: if it has moved" in result.stderr
 

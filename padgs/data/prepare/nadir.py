@@ -14,6 +14,7 @@ from padgs.data.capture import DataError, listed
 from padgs.data.images import decode, inspect, save_png
 from padgs.data.masks import MASK_FOLDERS, PREVIEW, SCENE_MASKS, row_weights
 from padgs.data.prepare.sources import mask_folder, panoramas
+from padgs.files import atomic_path
 
 MAX_WIDTH = 1024  # of the preview
 RED = (220, 30, 30)  # blended into masked pixels by half
@@ -62,7 +63,8 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
     preview = Image.fromarray(image.round().astype(np.uint8))
     preview.thumbnail((MAX_WIDTH, MAX_WIDTH // 2))
     try:
-        save_png(255 * use.expand(-1, width), target / SCENE_MASKS[0])
+        with atomic_path(target / SCENE_MASKS[0]) as draft:  # half a mask would be taken for one
+            save_png(255 * use.expand(-1, width), draft)
         preview.save(target / PREVIEW)
     except OSError as error:
         raise DataError(f"cannot write into {target} ({error.strerror or error}); check its permissions") from error
