@@ -26,7 +26,7 @@ import torch
 from PIL import Image
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from padgs import results
 from padgs.clock import Lap, timed
@@ -263,22 +263,21 @@ def find_smallest(
 def show(found: dict[str, Any], console: Console) -> None:
     """Print the smallest model for each loss, the knee, and the cost of the search."""
     steps = found["steps"]
-    table = Table("may lose", box=SIMPLE_HEAD)
-    for column in (found["row"], "interval", "by test", "of all", "blended", "MB", "ms", "lost, dB", "test dB"):
-        table.add_column(column, justify="right")
+    table = Table(Column("loss", no_wrap=True), box=SIMPLE_HEAD, pad_edge=False)
+    for column in (found["row"], "interval", "by test", "MB", "ms", "dB lost", "test dB"):
+        table.add_column(column, justify="right", no_wrap=True)
     titled = {"control": 0, **{f"{epsilon} dB": at for epsilon, at in found["minimal"].items()}, "knee": found["knee"]}
     for title, at in titled.items():
         if at is None:
-            table.add_row(title, *[MISSING] * 9)
+            table.add_row(title, *[MISSING] * 7)
             continue
         step, epsilon = steps[at], title.removesuffix(" dB")
         least, tested = found["possible"].get(epsilon), found["by_test"].get(epsilon)
         interval = MISSING if least is None else f"{min(steps[least]['rows'], step['rows'])}–{step['rows']}"
         by_test = MISSING if tested is None else str(steps[tested]["rows"])
-        share, size = f"{100 * step['rows'] / found['rows']:.0f} %", f"{step['bytes'] / 1e6:.2f}"
+        costs = f"{step['bytes'] / 1e6:.2f}", f"{step['frame_ms']:.1f}"
         quality = f"{step['loss']:.2f}", number("psnr", step["test_ws_psnr"])
-        cells = (str(step["rows"]), interval, by_test, share, str(step["blended"]), size, f"{step['frame_ms']:.1f}")
-        table.add_row(title, *cells, *quality)
+        table.add_row(title, str(step["rows"]), interval, by_test, *costs, *quality)
     console.print(table)
     console.print(
         f"Decided by {len(found['validation'])} validation views; interval: with 90 % confidence; by test: what the "
