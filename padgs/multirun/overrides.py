@@ -15,7 +15,6 @@ from typing import Any
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.errors import HydraException
 
 from padgs.checks import install_command, unknown
 
@@ -115,8 +114,6 @@ def problem(arguments: Sequence[str]) -> str | None:
     'photographs is no setting: these are KEY=VALUE, e.g. data.path=photographs; see padgs-run --help'
     >>> problem(["seed=1", "-m", "method=padgs", "++seed=2"])
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
-    >>> problem(["seed=[1"]).partition(";")[0]
-    "seed=[1 cannot be read (no viable alternative at input '[1')"
     >>> problem(["method=[a]"])
     'method=[a]: method is a group of settings, chosen by name; see padgs-run --help'
     >>> problem(["+sweep=tau,seeds"])
@@ -146,13 +143,6 @@ def problem(arguments: Sequence[str]) -> str | None:
             return f"{argument}: one {key} at a time, because each names what it sweeps"
         if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*|[\[{].*", value, re.IGNORECASE):
             return f"{argument}: {key} is a group of settings, chosen by name; {HELP}"
-        try:
-            OverridesParser.create().parse_override(quoted([argument])[0])
-        except HydraException as error:
-            reason = re.split(r"\n| expecting ", str(error))[0]
-            return (
-                f"{argument} cannot be read ({reason}); a value with special characters needs quotes: {key}='\"...\"'"
-            )
         settings[key] = argument
     launcher = settings.get("launcher", "=none").partition("=")[2]
     if launcher != "none" and not is_multirun(arguments) and SHOW not in arguments:

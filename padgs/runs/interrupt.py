@@ -67,6 +67,9 @@ def ending_by_signals(advice: str = "") -> Iterator[None]:
         # Interrupted code may raise another exception instead, such as an ImportError by an extension module.
         if not isinstance(error, KeyboardInterrupt) and not (_raised and getattr(error, "code", 1)):
             raise
+        for number in SIGNALS:  # another one, while threads end, kills without a traceback
+            if signal.getsignal(number) is _stop:
+                signal.signal(number, signal.SIG_DFL if number in IMPATIENT else signal.SIG_IGN)
         with suppress(OSError):  # of a terminal that was closed
             reason = str(error) if isinstance(error, KeyboardInterrupt) else ""
             print(printable(f"{reason or 'stopped'}{advice}"), file=sys.stderr)

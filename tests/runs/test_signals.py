@@ -174,3 +174,19 @@ def test_pycolmap_leaves_the_handler_of_sigterm(root):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, timeout=200)
     assert done.returncode == 128 + signal.SIGTERM and done.stderr == "stopped\n"
+
+
+def test_a_second_ctrl_c_while_threads_end_kills_without_a_traceback():
+    code = (
+        "import os, signal, sys, threading, time\n"
+        "from padgs.runs.interrupt import ending_by_signals\n"
+        "threading.Thread(target=lambda: time.sleep(60)).start()\n"
+        "with ending_by_signals():\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None and process.stderr.readline() == "stopped\n"
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == -signal.SIGINT and process.stderr.read() == ""
+    process.stderr.close()
