@@ -96,6 +96,8 @@ def exit_on_errors() -> Iterator[None]:
     """Exit with code 1 and the message of an expected error, without a traceback."""
     try:
         yield
+    except BrokenPipeError:  # the reader of the output has ended
+        raise
     except MissingConfigException as error:
         group, _, name = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
         complain(unknown(group, name, error.options or ()))
