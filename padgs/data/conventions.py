@@ -136,7 +136,7 @@ def _reordered(poses: Tensor) -> Tensor:
 
     if torch.linalg.det(poses[:, :3, :3]).min() <= 0:
         return poses
-    stated = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(scalar_first=True)
+    stated = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat()[:, [3, 0, 1, 2]]
     return _with(poses, torch.from_numpy(Rotation.from_quat(stated).as_matrix()), poses[:, :3, 3:])
 
 

@@ -39,13 +39,7 @@ MISREADINGS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
         lambda poses: _pose(poses[:, :3, :3], -poses[:, :3, :3] @ poses[:, :3, 3:]),
         "the camera centres are translations",
     ),
-    "x y z w": (
-        lambda poses: _pose(
-            Rotation.from_quat(Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(), scalar_first=True).as_matrix(),
-            poses[:, :3, 3:],
-        ),
-        "the quaternions are in the order x y z w",
-    ),
+    "x y z w": (lambda poses: _pose(_misread(poses), poses[:, :3, 3:]), "the quaternions are in the order x y z w"),
     "OpenGL inverse": (lambda poses: torch.linalg.inv(FLIP @ poses), "world from camera: invert them; camera axes"),
     "turned cloud": (lambda poses: poses @ Z_UP.T, r"different world frames: rotate the points, use \(x, z, -y\)"),
 }
@@ -95,8 +89,14 @@ def _poses(world: World) -> Tensor:
 
 def _pose(rotation: Tensor, translation: Tensor) -> Tensor:
     pose = torch.eye(4, dtype=torch.float64).repeat(len(rotation), 1, 1)
-    pose[:, :3, :3], pose[:, :3, 3:] = torch.as_tensor(rotation), translation
+    pose[:, :3, :3], pose[:, :3, 3:] = rotation, translation
     return pose
+
+
+def _misread(poses: Tensor) -> Tensor:
+    """Return the rotations whose quaternion x y z w was read as w x y z."""
+    x_y_z_w = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat()
+    return torch.from_numpy(Rotation.from_quat(x_y_z_w[:, [1, 2, 3, 0]]).as_matrix())
 
 
 def _center(poses: Tensor) -> Tensor:

@@ -154,7 +154,7 @@ def read_frames(model: Path) -> tuple[list[str], dict[int, NDArray[np.float64]]]
     def matrix(pose: Sequence[float]) -> NDArray[np.float64]:
         found = np.eye(4)
         if 0.4 < np.abs(pose[:4]).max() < 2 and np.abs(pose).max() < FARTHEST:  # else it agrees with no image
-            found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), pose[4:]
+            found[:3, :3], found[:3, 3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:]
         return found
 
     def rig(cursor: _Cursor | _Words) -> tuple[int, dict[tuple[int, int], NDArray[np.float64] | None]]:
