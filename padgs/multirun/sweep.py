@@ -38,7 +38,7 @@ from padgs.multirun.job import complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
 from padgs.results import Result, ResultError
 from padgs.runs.config import RunOptions
-from padgs.runs.console import Display, compact, duration, psnr_of, say
+from padgs.runs.console import Display, compact, duration, psnr_of, say, write
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import RETRIED
 from padgs.runs.store import RunStore, cannot_write, labels
@@ -238,7 +238,7 @@ class Multirun:
             table = Table("run", "result", box=SIMPLE_HEAD)
             for title, result in found:
                 table.add_row(*map(printable, (title or result.run, ", ".join(summary(result.status, result)))))
-            self._console.print(table)
+            write(self._console, table)
         if found:
             what = "all" if any(result.experiments for _, result in found) else "runs"
             self._say(f"next: {shlex.join(['padgs', 'report', what, str(self.runs)])}")
@@ -253,7 +253,8 @@ def titles(jobs: Sequence[Sequence[str]]) -> list[str]:
     >>> titles([["method=padgs", "++method.tau=0.3", "++seed=1"], ["method=padgs", "++method.tau=0.9", "++seed=1"]])
     ['tau = 0.3', 'tau = 0.9']
     """
-    settings = [dict(text.lstrip("+~").partition("=")[::2] for text in job) for job in jobs]
+    parts = [[text.lstrip("+~").partition("=") for text in job] for job in jobs]
+    settings = [{key: value for key, _, value in job} for job in parts]
     keys = dict.fromkeys(key for job in settings for key in job)
     varying = [key for key in keys if len({job.get(key) for job in settings}) > 1]
     return [", ".join(f"{key.rpartition('.')[2]} = {job[key]}" for key in varying if key in job) for job in settings]

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, RenderableType
@@ -27,12 +27,20 @@ if TYPE_CHECKING:
 
 def say(console: Console, text: object, style: str = "") -> None:
     """Print lines without wrapping."""
-    console.print(Text(printable(str(text)), style), soft_wrap=True)
+    write(console, Text(printable(str(text)), style), soft_wrap=True)
+
+
+def write(console: Console, *parts: RenderableType, **options: Any) -> None:
+    """Print to a console that may have been closed."""
+    with suppress(*UNREAD):
+        console.print(*parts, **options)
 
 
 REDRAWS_PER_SECOND = 5
 SECONDS_BETWEEN_LINES = 10.0  # without a terminal
 RECENT = 64  # records that the speed is measured over
+# Errors of a terminal that was closed, and of rich for a pipe whose reader has ended: they end no run.
+UNREAD = (OSError, SystemExit)
 COLUMNS, BAR = 80, 8  # characters of the progress line, and of the bar in it
 MISSING = "–"
 
@@ -60,7 +68,7 @@ class Display:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(OSError):
+        with suppress(*UNREAD):
             if self._live is not None:
                 self._live.stop()
 
@@ -72,7 +80,7 @@ class Display:
     def show(self, line: str, picture: RenderableType | None = None) -> None:
         """Show a line, or a picture if there is one and the console is a terminal."""
         self._shown = time.monotonic()
-        with suppress(OSError):  # a closed terminal ends no run
+        with suppress(*UNREAD):
             if self._live is not None:
                 self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
             else:
@@ -146,7 +154,7 @@ def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -
     what = f"{config.preset}{f' ({config.row})' if config.row else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
     rest = f": {views}, {len(scene.points)} points, {config.time}, on {scene.points.device}"
-    console.print(Text(printable(what), "bold"), rest, sep="", highlight=False, soft_wrap=True)
+    write(console, Text(printable(what), "bold"), rest, sep="", highlight=False, soft_wrap=True)
     for note in (*scene.notes, folder):
         say(console, f"  {note}", "dim")
 
@@ -155,12 +163,12 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     """Print metrics, cost and folder of a run."""
     if not result.ok:
         reason = printable(result.reason) or "stopped early"
-        console.print(Text.assemble((result.status, "bold red"), f": {reason}"), soft_wrap=True)
+        write(console, Text.assemble((result.status, "bold red"), f": {reason}"), soft_wrap=True)
     if result.ended:
         say(console, f"stopped early, after {result.iterations_done} iterations: {printable(result.ended)}", "yellow")
     if result.scores:
         say(console, headline(result), "bold" if result.ok else "")
-        console.print(marks(result))
+        write(console, marks(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
         say(console, note, "yellow")
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]

@@ -1,9 +1,11 @@
+import errno
 import io
 
+import pytest
 from rich.console import Console
 
 from padgs.runs import console as run_console
-from padgs.runs.console import LiveLine
+from padgs.runs.console import LiveLine, say
 from padgs.training.loop import Record
 
 
@@ -27,6 +29,18 @@ def test_without_a_terminal_a_line_every_ten_seconds_and_the_last(monkeypatch):
     assert shown[1] == "ETA 0:12  ████░░░░  50%  6  loss 0.2500  21.50 dB  1.23k anchors  0.5 it/s"
     assert "dB" not in shown[0] and shown[0].startswith("ETA –  █░░░░░░░   8%")
     assert max(map(len, shown)) <= 80
+
+
+@pytest.mark.parametrize("number", [errno.EPIPE, errno.EIO])
+def test_output_that_nobody_reads_ends_nothing(number):
+    class Closed(io.StringIO):
+        def write(self, text):
+            raise OSError(number, "nobody reads")
+
+    console = Console(file=Closed(), width=80)
+    say(console, "one")
+    with LiveLine(console) as line:
+        line.update(Record(1, 1.0, 0.25, 0.0, 0.0, {}), None)
 
 
 def test_a_terminal_has_one_line_that_changes(monkeypatch):
