@@ -261,7 +261,7 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     try:
         if digest != _digest(document):
             raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
-        result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
+        result = Result(**document | {key: _part(key, document[key]) for key in _DECODERS})
         _refuse_other_types(result)
     except ResultError:
         raise
@@ -355,3 +355,10 @@ def _scores(table: dict[str, Any]) -> dict[str, Scores]:
 
 
 _DECODERS = {"scores": _scores, "timing": _numbers, "experiments": tuple}
+
+
+def _part(key: str, value: Any) -> Any:
+    try:
+        return _DECODERS[key](value)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise TypeError(f"{key} does not have the form that this program writes ({str(value):.60})") from error
