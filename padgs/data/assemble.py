@@ -188,7 +188,9 @@ def _refuse_missing(capture: Capture) -> None:
     remedy = "set data.images to the folder that holds them, or compute poses of the images that exist (padgs prepare)"
     last_names = {PurePosixPath(name).name for name in absent}
     elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).name in last_names), None)
-    if hint:
+    if hint in absent:
+        remedy = f"{hint!r} is a pipe, a device or a broken link: put the image in its place"
+    elif hint:
         remedy = f"there is {hint!r}, which differs in case: rename it"
     elif elsewhere:
         remedy = f"{capture.folder / elsewhere} has the name of one: set data.images to the folder that holds them"

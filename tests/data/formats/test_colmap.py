@@ -1,5 +1,6 @@
 """COLMAP models: written by hand, damaged, and real."""
 
+import os
 import shutil
 import struct
 from pathlib import Path
@@ -41,6 +42,11 @@ def test_names_that_differ_in_case_are_reported(world: World, tmp_path: Path) ->
     write_colmap_text(world, tmp_path)
     (tmp_path / "images" / "pano_03.png").rename(tmp_path / "images" / "Pano_03.PNG")
     with pytest.raises(DataError, match="there is 'Pano_03.PNG', which differs in case: rename it"):
+        load(tmp_path)
+    os.mkfifo(tmp_path / "images" / "pano_03.png")
+    with pytest.raises(
+        DataError, match="'pano_03.png' is a pipe, a device or a broken link: put the image in its place"
+    ):
         load(tmp_path)
 
 
