@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
@@ -147,7 +148,9 @@ def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
 def _test(advantages: Any) -> Any:
     from scipy.stats import ttest_rel
 
-    return ttest_rel(advantages, [0.0] * len(advantages))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # equal advantages have no spread
+        return ttest_rel(advantages, [0.0] * len(advantages))
 
 
 def _verdict(evidence: Evidence) -> str:
