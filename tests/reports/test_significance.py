@@ -71,4 +71,5 @@ def test_rows_share_a_place_exactly_as_long_as_no_test_separates_them(numbers, c
 def test_what_is_not_ranked_neither_stands_out_nor_stands_in_the_way():
     aside = Cell(9.0, ranked=False)
     assert ranks(PSNR, ONE, aside, TWO) == {2: BEST, 0: SECOND}
-    assert Row("A", (Cell(1.0), aside)).texts((PSNR, PSNR)) == ["A †", "1.00", "9.00"]
+    assert Row("A", (aside, Cell())).texts((PSNR, PSNR)) == ["A †", "9.00", "–"]
+    assert Row("A", (Cell(1.0), aside)).texts((PSNR, PSNR)) == ["A", "1.00", "9.00 †"]
