@@ -218,6 +218,8 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
         "omega_input": "cos",
         "max_modulated_omega": 1 - 1e-4,
         "distance_unit": "world",
+        "offset_rate": (0.01, 0.0001),
+        "offset_rate_unit": "world",
         "gradient_threshold": PUBLISHED_THRESHOLD,
         "log_scale_cap": 0.05,
         "max_anchors": None,
