@@ -106,7 +106,7 @@ class SplatMethod(Method):
         limit = lowest_limit(options.max_gaussians, limit if self._target is None else self._target)
         for_points = None if limit is None else math.ceil(limit / (1 + options.sky_per_point))
         start = lowest_limit(start, for_points)
-        points, generator = self._filled_scene(scene, 0 if filled is None else lowest_limit(filled, start))
+        points, generator = self._filled_scene(scene, (lowest_limit(filled, start) or 0) if filled else 0)
         splats = Splats.from_scene(
             points,
             degree=options.sh_degree,
