@@ -4,11 +4,14 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
+
+from padgs.runs import interrupt
 
 # Generated examples are the same on every machine, and a slow machine is not a failure.
 settings.register_profile("padgs", deadline=None, derandomize=True)
@@ -23,6 +26,18 @@ def ctrl_c() -> None:
     """Signals that a shell or nohup lets its children ignore; tests of them would wait in vain."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """Handlers of signals, and what is known of received ones, are those of before after each test."""
+    before = {number: signal.getsignal(number) for number in (*interrupt.SIGNALS, signal.SIGUSR1, signal.SIGUSR2)}
+    yield
+    for number, handler in before.items():
+        if handler is not None and signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
+    interrupt._raised.clear()
+    interrupt._received.clear()
 
 
 @pytest.fixture(scope="session")
