@@ -64,7 +64,7 @@ def test_a_sweep_that_was_killed_three_times_ends_as_if_nothing_had_been(start, 
     assert code == 0, out + error
     assert marks(tmp_path / "disturbed") == expected
     code, out, _ = finish(start(*TINY, *SWEEP, "run.folder=disturbed"))
-    assert code == 0 and out == "12 of 12 done (12 before)\n"
+    assert code == 0 and out.startswith("12 of 12 done (12 before)\n")
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_all_launchers_give_the_same_results(start, tmp_path):
     found = []
     for launcher in ("none", "local", "submitit"):
         code, out, error = finish(start(*TINY, "-m", "seed=0,1,2,3", f"launcher={launcher}", f"run.folder={launcher}"))
-        assert code == 0 and out.endswith("4 of 4 done\n"), out + error
+        assert code == 0 and "\n4 of 4 done\n" in out, out + error
         found.append(marks(tmp_path / launcher))
     assert len(found[0]) == 4 and found[0] == found[1] == found[2]
 
@@ -86,5 +86,5 @@ def test_two_processes_share_a_sweep_and_do_every_run_once(start, tmp_path):
     assert {code for code, _, _ in ends} <= {0, 1}  # 1: the other one was still at the last run
     assert len(marks(tmp_path / "runs")) == 6
     resumed = sum(out.count("resuming") for _, out, _ in ends)
-    trained = sum(out.count("trained 0:") - out.count("finished before, nothing") for _, out, _ in ends)
+    trained = sum(out.count("100%") for _, out, _ in ends)
     assert (resumed, trained) == (0, 6)
