@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line ove
     "release": {"linewidth": 0.7, "zorder": 2.0, "linestyle": (0, (4, 2))},
 }
 NAMED, DIP = 5, 0.5  # names in a chart over time; dB of a dip that is left out
+LINE = 90  # characters below a panel
 END_RADIUS = 2.5  # points, of the mark at the end of a run
 
 
@@ -64,13 +66,7 @@ def chart(trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()) -> Ch
     the number of Gaussians. Releases are small rings, and not in the Pareto front. Variants are faint.
     """
     made, panels = draw(trade_off, shown)
-    beyond = {
-        f"{mark.point.title} ({mark.y:.1f} dB, {brief(mark.x)} {unit})"
-        for axes, marks, unit, _ in panels
-        for mark in marks
-        if not _inside(axes, mark)
-    }
-    notes = (*trade_off.notes, *([f"Beyond the axes: {'; '.join(sorted(beyond))}."] if beyond else []))
+    notes = (*trade_off.notes, *_beyond((axes, marks, unit) for axes, marks, unit, _ in panels))
     return Chart(trade_off.name, trade_off.title, made, notes, trade_off.numbers)
 
 
@@ -95,7 +91,9 @@ def draw(
         _draw_front(panel, [(mark.x, mark.y) for mark in rivals])
         for mark in own:
             _draw(panel, trade_off, mark, COSTS[cost].column.title, scale, presets)
-    look = {"title": _conditions(trade_off), "ncols": 8, "fontsize": 8, "title_fontsize": 8}
+    units = (unit for _, _, unit in shown)
+    beyond = wrap(" ".join(_beyond(zip(axes.flat, marks, units, strict=True))), LINE * len(shown))
+    look = {"title": "\n".join([_conditions(trade_off), *beyond]), "ncols": 8, "fontsize": 8, "title_fontsize": 8}
     made.legend(handles=_handles([mark for of in marks for mark in of], scale), loc="outside lower center", **look)
     lay_out(made, trade_off.title)
     return made, [
@@ -108,8 +106,8 @@ def draw(
 def time_chart(trade_off: TradeOff) -> Chart | None:
     """Return held-out PSNR over training seconds, with a label where a run ends; None if no run has a log.
 
-    The axis of quality shows the range of the later halves of the runs (`axis.window`). Releases are dashed. The best
-    `NAMED` settings have names; dips after resets of opacities are left out.
+    The axis of quality shows the range of the later halves of the runs (`axis.window`). Releases are dashed. `NAMED`
+    methods have a colour and a name at their best setting; dips after resets of opacities are left out.
     """
     curves = _curves(trade_off)
     if not curves:
@@ -118,23 +116,35 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     panel, presets, labels = axes[0, 0], [setting.preset for setting, _, _ in curves], []
     set_axis(panel.xaxis, [s for _, seconds, _ in curves for s in seconds if s > 0], logarithmic=True)
     low, high = set_axis(panel.yaxis, [v for _, _, psnr in curves for v in psnr[len(psnr) // 2 :]], worse=-1)
+    named = _named(trade_off, curves, low, high)
     for setting, seconds, psnr in curves:
         title, preset, role = setting.title, setting.preset, trade_off.role(setting.preset)
-        look = {"color": color_of(preset, presets), "alpha": ALPHA[role]} | LOOKS[role]
+        color = color_of(preset, presets) if preset in named else SOFT[0]
+        look = {"color": color, "alpha": ALPHA[role]} | LOOKS[role]
         panel.plot(seconds, psnr, **look)
         gid = tip(f"{title}\n{psnr[-1]:.2f} dB after {seconds[-1]:.0f} s")
         panel.plot(seconds[-1], psnr[-1], **look, marker="o", markersize=2 * END_RADIUS, gid=gid)
-        if role != "release" and low <= psnr[-1] <= high:
+        if named.get(preset) == title:
             text = methods.short(title, preset)
             labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
     panel.set_xlabel("training time in seconds, evaluations not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
-    title = f"{trade_off.title}\nquality over training time, without dips after resets; dashed: as released"
+    title = f"{trade_off.title}\nquality over training time, without dips after resets; grey: other methods, dashed: as released"
     lay_out(made, title)
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
-    labels.sort(key=lambda label: (label.weight == "faint", -label.at[1]))
-    write_labels(panel, labels[:NAMED], ends)
+    write_labels(panel, labels, ends)
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, trade_off.notes)
+
+
+def _named(trade_off: TradeOff, curves: Sequence[Any], low: float, high: float) -> dict[str, str]:
+    """Return the best setting within the axis of `NAMED` methods: preset -> title; ours and main presets first."""
+    best: dict[str, tuple[Any, ...]] = {}
+    for setting, _, psnr in curves:
+        role = trade_off.role(setting.preset)
+        if role != "release" and low <= psnr[-1] <= high:
+            rank = (weight_of(setting.preset, role) != "bold", role != "main", -psnr[-1], setting.title)
+            best[setting.preset] = min(rank, best.get(setting.preset, rank))
+    return {preset: best[preset][-1] for preset in sorted(best, key=best.__getitem__)[:NAMED]}
 
 
 def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]]]:
@@ -166,6 +176,17 @@ def _marks(trade_off: TradeOff, cost: str) -> list[Mark]:
     """Return a mark for each point with a quality and a positive cost."""
     numbers = [(point, point.value(COSTS[cost]), point.value(trade_off.quality)) for point in trade_off.points]
     return [Mark(point, trade_off.role(point.preset), x, y) for point, x, y in numbers if x and y is not None]
+
+
+def _beyond(panels: Iterable[tuple[Any, Sequence[Mark], str]]) -> list[str]:
+    """Return a sentence that names the marks outside of axes; empty if there are none."""
+    found = {
+        f"{mark.point.title} ({mark.y:.1f} dB, {brief(mark.x)} {unit})"
+        for axes, marks, unit in panels
+        for mark in marks
+        if not _inside(axes, mark)
+    }
+    return [f"Beyond the axes: {'; '.join(sorted(found))}."] if found else []
 
 
 def _inside(panel: Any, mark: Mark) -> bool:

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,6 +47,8 @@ def test_axes_show_where_methods_differ_and_a_note_names_those_beyond():
         assert [mark.point.preset for mark in marks if not low < mark.y < high] == ["egonerf_small"]
         assert not any("EgoNeRF" in text.get_text() for text in texts)
     assert "Beyond the axes: EgoNeRF, small (15.6 dB, " in "".join(chart(made).notes)
+    (legend,) = draw(made)[0].legends
+    assert "Beyond the axes: EgoNeRF, small (15.6 dB, " in legend.get_title().get_text(), "of a picture read alone"
 
 
 def test_releases_are_small_rings_and_not_in_the_front():
@@ -107,3 +110,19 @@ def test_quality_over_training_time_comes_from_the_logs(tmp_path, monkeypatch):
     assert len(logged.points) > NAMED == len(named[0])
     assert "<title>PaD-GS\n25.52 dB after 200 s</title>" in made.svg  # 26.05 of two seeds - 8 / 15 at the last probe
     assert time_chart(one(runs)) is None, "no quality over time without a log"
+
+
+def test_each_method_has_one_name_over_time_at_its_best_setting_within_the_axis():
+    made = one([small(20 + n, 1.0, method=preset) for n, preset in enumerate(["padgs", "odgs", "spags", "omnigs"])])
+    ends = [
+        ("padgs", 20),
+        ("padgs", 21),
+        ("odgs", 25),
+        ("odgs", 24),
+        ("spags", 30),
+        ("spags", 99),
+        ("padgs_release", 28),
+    ]
+    curves = [(SimpleNamespace(preset=preset, title=f"{preset} {end}"), [1.0], [end]) for preset, end in ends]
+    named = trade_off_chart._named(made, curves, 10, 50)
+    assert [*named.items()] == [("padgs", "padgs 21"), ("spags", "spags 30"), ("odgs", "odgs 25")]
