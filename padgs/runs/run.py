@@ -30,7 +30,7 @@ from padgs.runs.device import choose_device
 from padgs.runs.interrupt import STOP_SIGNALS, Interrupt, Interrupted
 from padgs.runs.store import Progress, RunBusy, RunFolderError, RunStore, config_hash
 from padgs.scene import Scene
-from padgs.training.health import Failure, is_out_of_memory, memory_reason, validation_folds
+from padgs.training.health import Failure, is_out_of_memory, memory_reason, validation_folds, validation_split
 from padgs.training.loop import Record
 from padgs.training.method import Method
 from padgs.training.options import AUTO
@@ -176,8 +176,11 @@ def load_scene(config: RunConfig, device: torch.device) -> Scene:
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
     scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
     scene = config.stress.apply(scene, config.seed).recentered().to(device)
-    if config.smallest == "on" or config.budget.stop == AUTO:
-        validation_folds(scene.train)  # refuses too few views before hours of training
+    # Both refuse too few views, before hours of training.
+    if config.budget.stop == AUTO:
+        validation_split(scene.train)
+    if config.smallest == "on":
+        validation_folds(scene.train)
     return scene
 
 

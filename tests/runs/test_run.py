@@ -222,6 +222,13 @@ def test_a_damaged_checkpoint_is_named_and_nothing_is_started(config, monkeypatc
     assert not (folder_of(config).path / "result.json").exists()
 
 
+def test_too_few_views_for_early_stopping_are_refused_before_training(config, monkeypatch):
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained"))
+    with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
+        run(replace(config, budget=replace(config.budget, stop="auto")))
+    assert not Path(config.run.folder).exists() or not [*Path(config.run.folder).glob("*/result.json")]
+
+
 @pytest.mark.parametrize("change", ["seed=1", "method.features=16", "train.lambda_l1=0.5"])
 def test_a_checkpoint_of_another_run_is_refused(config, monkeypatch, tmp_path, change):
     other = composed(*SMALL, f"run.folder={tmp_path}/other", f"train.iterations={ITERATIONS}", change)
