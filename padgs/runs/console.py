@@ -168,7 +168,7 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
         say(console, f"stopped early, after {result.iterations_done} iterations: {printable(result.ended)}", "yellow")
     if result.scores:
         say(console, headline(result), "bold" if result.ok else "")
-        write(console, marks(result))
+        write(console, metric_table(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
         say(console, note, "yellow")
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
@@ -208,7 +208,7 @@ def headline(result: Result) -> str:
     return f"{psnr:.1f} dB on {count} {views}" + (f": {word}" if result.ok else "")
 
 
-def marks(result: Result) -> Table:
+def metric_table(result: Result) -> Table:
     """Return a table of metrics: a row per metric, a column per protocol, and the meaning."""
     table = Table("metric", box=SIMPLE_HEAD)
     for protocol in result.scores:
