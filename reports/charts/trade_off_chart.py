@@ -129,7 +129,8 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
             labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
     panel.set_xlabel("training time in seconds, evaluations not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
-    title = f"{trade_off.title}\nquality over training time, without dips after resets; grey: other methods, dashed: as released"
+    meaning = "without dips after resets; grey: other methods, dashed: as released"
+    title = f"{trade_off.title}\nquality over training time, {meaning}"
     lay_out(made, title)
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
     write_labels(panel, labels, ends)
