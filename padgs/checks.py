@@ -1,4 +1,7 @@
-"""Checks of options; messages name the option, its value, and the rule or the known names."""
+"""Checks of options, and registries; messages name the option, its value, and the rule or the known names.
+
+A registry is a dict of name -> "package.module:attribute"; nothing is imported before it is asked for.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
+from importlib import import_module
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 
@@ -45,6 +49,33 @@ def unknown(what: str, name: object, known: Collection[str], meant: Sequence[str
     close = meant or difflib.get_close_matches(str(name), known, 1)
     question = f"; did you mean {' or '.join(close)}?" if close else ""
     return f"unknown {what} {name!r}; known: {', '.join(known)}{question}"
+
+
+def lookup(registry: Mapping[str, str], name: str, kind: str) -> Any:
+    """Import and return the entry `name` of `registry`.
+
+    Args:
+        registry: name -> "package.module:attribute".
+        name: the entry wanted.
+        kind: what the registry holds, for the error message ("backend", "method", ...).
+
+    Raises:
+        ValueError: `name` is not registered (the message lists the names that are), or is of another package that
+            fails, or ends the program, when it is imported.
+
+    >>> lookup({"sqrt": "math:sqrt"}, "sqrt", "function")(9.0)
+    3.0
+    """
+    if name not in registry:
+        raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(sorted(registry))}")
+    module, _, attribute = registry[name].partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except (Exception, SystemExit) as error:
+        if module.partition(".")[0] == "padgs":
+            raise
+        why = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{kind} {name} cannot be used: {registry[name]} of another package fails ({why})") from error
 
 
 # Least and greatest numbers by the name of their key or its last word, and for all others by type. Beyond them a number

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from support.composed import composed, expanded, first_and_last_job, jobs
 
 from padgs.baselines import METHODS
-from padgs.checks import ConfigError
+from padgs.checks import ConfigError, lookup
 from padgs.data.datasets import DATASETS
 from padgs.data.perturb import CONDITIONS
 from padgs.data.synthetic.options import SyntheticOptions
@@ -22,7 +22,6 @@ from padgs.methods.anchors.method import PaDGSMethodOptions
 from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.multirun.composition import composing, configuration, variant_choices
 from padgs.multirun.overrides import expand, lenient, missing_plugin, quoted
-from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.reports.conditions import CALIBRATES
 from padgs.runs.config import RunOptions, TrainConfig, method_choices

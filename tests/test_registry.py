@@ -4,8 +4,8 @@ import sys
 import pytest
 
 from padgs.baselines import METHODS
+from padgs.checks import lookup
 from padgs.data import LOADERS
-from padgs.registry import lookup
 from padgs.render import BACKENDS, leave_one_out
 from padgs.render.projection import PROJECTIONS
 
@@ -35,7 +35,7 @@ def test_an_unknown_name_lists_the_known_ones(kind):
 def test_nothing_is_imported_before_it_is_asked_for(root):
     code = (
         "import sys\n"
-        "from padgs.registry import lookup\n"
+        "from padgs.checks import lookup\n"
         "registry = {'wanted': 'colorsys:rgb_to_hsv', 'broken': 'no_such_module:thing'}\n"
         "assert 'colorsys' not in sys.modules and 'torch' not in sys.modules\n"
         "assert lookup(registry, 'wanted', 'thing')(1, 1, 1) == (0.0, 0.0, 1)\n"

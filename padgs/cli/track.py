@@ -31,7 +31,7 @@ def track(
         experiment = " ".join(name for name in result.experiments if name != results.AD_HOC)
         if experiment not in trackers:
             trackers[experiment] = Tracker(options, Path(runs), experiment, show)
-        trackers[experiment].update(folder)
+        trackers[experiment].add(folder)
         if not trackers[experiment].on:
             raise typer.Exit(1)
     show(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

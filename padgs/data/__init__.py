@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from padgs.checks import lookup
 from padgs.data.assemble import assemble, found_images
 from padgs.data.capture import Capture, DataError, DataOptions
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
-from padgs.registry import lookup
 from padgs.scene import Scene
 
 # `read(path, options) -> Capture`, except synthetic, which reads no files: `load(path, options) -> Scene`.

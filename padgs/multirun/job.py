@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sys
-import time
 import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 
 from hydra.conf import HydraConf
@@ -29,7 +27,6 @@ from padgs.runs.load import load_run
 from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
 from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy, RunStore
-from padgs.runs.tracking import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
 
@@ -118,22 +115,3 @@ def exit_on_errors() -> Iterator[None]:
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:
     """Return whether the launcher runs jobs in other processes than its own."""
     return not str(hydra.launcher._target_).endswith("BasicLauncher")
-
-
-class TrackedRun(Callback):
-    """Callback that mirrors the only run of a process from time to time."""
-
-    def __init__(self, config: RunConfig, console: Console) -> None:
-        self._runs, experiment = Path(config.run.folder), " ".join(config.labels.experiments)
-        self._tracker = Tracker(config.tracking, self._runs, experiment, partial(say, console, style="dim"))
-        self._looked = time.monotonic()
-
-    def saved(self, folder: Path) -> None:
-        """Mirror the run, whose log is up to date."""
-        if time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
-            self._tracker.update(folder)
-            self._looked = time.monotonic()
-
-    def ended(self, result: Result) -> None:
-        """Mirror the run, which has ended with a result."""
-        self._tracker.update(self._runs / result.run)

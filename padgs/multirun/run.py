@@ -19,24 +19,29 @@ def main() -> None:
 
         with exit_on_errors():
             _answer(arguments)
+            from pathlib import Path
+
             from rich.console import Console
 
             from padgs.multirun.board import OK
             from padgs.multirun.composition import composing, configuration, multirun
-            from padgs.multirun.job import TrackedRun, search_smallest, served_scene
+            from padgs.multirun.job import search_smallest, served_scene
             from padgs.multirun.sweep import sweep
-            from padgs.runs.run import run
+            from padgs.runs.console import say
+            from padgs.runs.run import Callback, run
+            from padgs.runs.tracking import Tracker
 
             with composing() as loader:
                 if composed := multirun(arguments):
                     ends = {*sweep(composed, loader)}
                 else:
                     config, console = configuration(arguments), Console()
-                    callback = TrackedRun(config, console)
+                    runs, experiment = Path(config.run.folder), " ".join(config.labels.experiments)
+                    tracker = Tracker(config.tracking, runs, experiment, lambda line: say(console, line, "dim"))
                     with served_scene(config) as scene:
-                        result = run(config, console, callback, scene)
-                    search_smallest(config, scene, result, console, callback)
-                    callback.ended(result)
+                        result = run(config, console, scene=scene)
+                    search_smallest(config, scene, result, console, Callback())
+                    tracker.add(runs / result.run)
                     ends = {result.status}
         sys.exit(0 if ends <= {OK} else 1)
 

@@ -42,7 +42,7 @@ from padgs.runs.console import Display, compact, duration, psnr_of, say, write
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import RETRIED
 from padgs.runs.store import RunStore, cannot_write, labels
-from padgs.runs.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
+from padgs.runs.tracking import Tracker, TrackingOptions
 
 ATTEMPTS = 2  # of a job that began and whose process died: another job may have caused it
 IDLE_LAUNCHES = 5  # in a row in which no job began
@@ -108,8 +108,7 @@ class Multirun:
         digest = hashlib.sha256(repr(sorted(map(sorted, jobs))).encode()).hexdigest()[:8]
         options = typed(TrackingOptions, config.tracking if self.jobs else {"kind": "none"}, "tracking")
         self._tracker = Tracker(options, self.runs, names, self._say, f"{names or 'multirun'} {digest}")
-        self._tracked: set[int] = set()  # jobs whose end is mirrored
-        self._began = self._looked = time.monotonic()
+        self._began = time.monotonic()
 
     def run(self, launcher: Any, batch_size: int | None) -> None:
         """Launch the missing jobs, all or some at a time; if stopped from outside, running jobs write checkpoints."""
@@ -141,7 +140,6 @@ class Multirun:
                 reason = f"a job ended without a status: {error or f'check the free space in {self.runs}'}"
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
-            self._track()
 
     def counts(self) -> Counter[str]:
         """Return status -> number of jobs, those finished before included."""
@@ -159,7 +157,6 @@ class Multirun:
                 self._end(index, replace(state, status=result.status))
         self._say(self.line())
         self._show_table()
-        self._track()
         counts = self.counts()
         ended = [state.status for state in self.states.values() if state.status in results.STATUSES]
         self._tracker.finish(ended, len(self.states))
@@ -193,19 +190,8 @@ class Multirun:
     def _tick(self, stop: Interrupt, display: Display) -> None:
         if stop.requested:
             self.board.request_stop()
-        elif time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
-            self._track()
         if display.is_due:
             display.show(self.line())
-
-    def _track(self) -> None:
-        """Mirror runs that are running or have ended since the last time."""
-        self._looked = time.monotonic()
-        for index, state in list(self.states.items()):
-            if index not in self._tracked and state.run and (self.runs / state.run / results.CONFIG_NAME).exists():
-                self._tracker.update(self.runs / state.run)
-                if state.ended:
-                    self._tracked.add(index)
 
     def _follow(self, indices: Iterable[int]) -> None:
         """Read the states of jobs from the board."""
@@ -222,6 +208,7 @@ class Multirun:
         if state.status in results.STATUSES and state.run:
             self._finished.add(self.jobs[index], state.run, state.status, state.data)
             self._rows.append((self._titles[index], state.run))
+            self._tracker.add(self.runs / state.run)
             line = f"{self._titles[index] or state.run}: {', '.join(summary(state.status, self._result(state.run)))}"
             more = status_line(self.before, [*self.states.values()], time.monotonic() - self._began)
             is_last = all(one.ended for one in self.states.values())

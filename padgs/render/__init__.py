@@ -13,9 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.checks import check_known
+from padgs.checks import check_known, lookup
 from padgs.gaussians import Gaussians
-from padgs.registry import lookup
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
 from padgs.scene import View

@@ -17,8 +17,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from padgs.checks import lookup
 from padgs.gaussians import Gaussians
-from padgs.registry import lookup
 from padgs.render import make_request, resolve_backend
 from padgs.render.backends.torch import blocks, fragments, sorted_weights
 from padgs.render.contract import CORE_SIZE, Removals, RenderOptions, Request

@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from padgs.checks import lookup
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
-from padgs.registry import lookup
 from padgs.render.contract import ALPHA_MIN, FURTHEST, NEAREST, RenderOptions, Request
 
 PROJECTIONS = {

@@ -8,14 +8,13 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from padgs.baselines import METHODS
-from padgs.checks import ConfigError, Key, check, check_known, typed, unknown
+from padgs.checks import ConfigError, Key, check, check_known, lookup, typed, unknown
 from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
 from padgs.data.perturb import CONDITIONS, NONE, StressOptions
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
-from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.store import Labels

@@ -18,10 +18,10 @@ from rich.console import Console
 
 from padgs import clock, data, results
 from padgs.baselines import METHODS, distribution
+from padgs.checks import lookup
 from padgs.data.capture import DataError
 from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
-from padgs.registry import lookup
 from padgs.results import STATUSES, STOP_REQUESTED, Result
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig

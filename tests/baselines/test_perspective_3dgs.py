@@ -13,10 +13,10 @@ from support.tiny_scene import tiny_scene
 from padgs.baselines import METHODS
 from padgs.baselines.crops_3dgs import Crops3DGSMethod
 from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
+from padgs.checks import lookup
 from padgs.data.perspectives import solid_angle
 from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import rays
-from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.training.options import Budget, TrainOptions
 

@@ -12,13 +12,13 @@ from support.tiny_scene import squared_error, tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.baselines.spags import SPaGSMethod, SPaGSOptions
+from padgs.checks import lookup
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Panorama
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
-from padgs.registry import lookup
 from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends.cpu import Projected
 from padgs.render.backends.native import native_camera

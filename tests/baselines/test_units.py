@@ -7,8 +7,8 @@ import torch
 from support.tiny_scene import in_other_units, tiny_scene
 
 from padgs.baselines import METHODS
+from padgs.checks import lookup
 from padgs.methods.splats.method import SplatMethod
-from padgs.registry import lookup
 from padgs.scene import Scene
 from padgs.training.options import Budget
 

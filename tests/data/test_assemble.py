@@ -134,7 +134,7 @@ def test_unusable_options(field: str, value: object, message: str) -> None:
 
 
 def test_every_loader_can_be_imported() -> None:
-    from padgs.registry import lookup
+    from padgs.checks import lookup
 
     for name in LOADERS:
         assert callable(lookup(LOADERS, name, "data.format"))

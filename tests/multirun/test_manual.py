@@ -6,9 +6,9 @@ import pytest
 from typer.testing import CliRunner
 
 from padgs.baselines import METHODS
+from padgs.checks import lookup
 from padgs.cli.commands import app
 from padgs.multirun.manual import keys, manual
-from padgs.registry import lookup
 from padgs.runs.config import Settings
 
 

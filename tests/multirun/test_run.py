@@ -12,11 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import HydraException
 from support.tiny_run import SMALLEST, finish
 
 from padgs import results
+from padgs.multirun.job import exit_on_errors
 from padgs.multirun.overrides import lenient
 from padgs.runs import checkpoint
+from padgs.training.health import Failure
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [*SMALLEST, "train.iterations=300", "run.checkpoint_every=10", "run.probe_every=50", "tracking=none"]
@@ -152,3 +155,12 @@ def test_only_values_are_forced_past_hydra():
     line = shlex.split("method=omnigs +experiment=x ++a.b=1 ~c hydra.mode=RUN -m seed=1 train.max_seconds=3")
     forced = shlex.split("method=omnigs +experiment=x ++a.b=1 ~c hydra.mode=RUN -m ++seed=1 ++train.max_seconds=3")
     assert lenient(line) == forced
+
+
+@pytest.mark.parametrize(
+    "error", [Failure("oom", "no memory for a search"), ValueError("no such data"), HydraException("no such choice")]
+)
+def test_expected_errors_are_reported_without_a_traceback(capsys, error):
+    with pytest.raises(SystemExit, match="1"), exit_on_errors():
+        raise error
+    assert capsys.readouterr().err == f"error: {error}\n"

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from support.made_up import RULES, builder, compared, failed, of_experiment, result, run_set, small
 
 from padgs.baselines import BUILT_IN, METHODS
-from padgs.registry import lookup
+from padgs.checks import lookup
 from padgs.reports.frame import law
 from padgs.reports.methods import title
 from padgs.reports.significance import BEST, SECOND, emphasis

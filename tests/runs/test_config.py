@@ -7,10 +7,9 @@ import pytest
 from support.composed import configuration
 
 from padgs.baselines import METHODS
-from padgs.checks import ConfigError
+from padgs.checks import ConfigError, lookup
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.multirun.composition import composing
-from padgs.registry import lookup
 from padgs.runs.config import Settings, config_from_values
 
 MEANINGLESS = {

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,17 +12,18 @@ from padgs.checks import install_command
 from padgs.cli.commands import app
 from padgs.results import Result, Scores
 from padgs.runs import tracking
-from padgs.runs.tracking import Tracker, TrackingOptions, batches
+from padgs.runs.tracking import Tracker, TrackingOptions
 
 NEEDS_MLFLOW = pytest.mark.filterwarnings("ignore")  # what it warns of is not ours
 
 
-def make_run(runs: Path, name: str = "room_padgs_1", *, status: str = "ok", iterations: int = 30) -> Path:
+def make_run(runs: Path, name: str = "room_padgs_1", *, status: str = "ok") -> Path:
     run = runs / name
     (run / "renders").mkdir(parents=True)
     (run / "renders" / "000.png").write_bytes(b"a picture")
     (run / "config.yaml").write_text("method: {name: padgs, tau: 0.9}\nseed: 0\n")
-    log(run, range(10, iterations + 1, 10))
+    lines = ({"iteration": n, "loss": 1 / n, "events": ["x"]} for n in range(10, 31, 10))
+    (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     machine = {"cpu": "a processor", "cores": 2, "torch": "2.13.0", "gpu": None}
     marks = {"paper": Scores({"lpips": "none"}, {"psnr": 20.0, "ssim": None}, {})} if status == "ok" else {}
     result = Result(
@@ -33,11 +35,6 @@ def make_run(runs: Path, name: str = "room_padgs_1", *, status: str = "ok", iter
     return run
 
 
-def log(run: Path, iterations) -> None:
-    with (run / "log.jsonl").open("a") as file:
-        file.writelines(json.dumps({"iteration": n, "loss": 1 / n, "events": ["x"]}) + "\n" for n in iterations)
-
-
 @pytest.fixture
 def said():
     return []
@@ -46,7 +43,7 @@ def said():
 def test_none_needs_nothing_and_writes_nothing(tmp_path, said, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: pytest.fail("looked for mlflow"))
     tracker = Tracker(TrackingOptions("none"), tmp_path, "tau", said.append)
-    tracker.update(make_run(tmp_path))
+    tracker.add(make_run(tmp_path))
     assert said == [] and [path.name for path in tmp_path.iterdir()] == ["room_padgs_1"]
 
 
@@ -56,7 +53,7 @@ def test_none_needs_nothing_and_writes_nothing(tmp_path, said, monkeypatch):
 def test_without_mlflow_one_line_says_so_to_who_asked_for_it(tmp_path, said, monkeypatch, options, lines):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     tracker = Tracker(options, tmp_path, "tau", said.append)
-    tracker.update(make_run(tmp_path))
+    tracker.add(make_run(tmp_path))
     tracker.finish([], 0)
     assert not tracker.on and len(said) == lines
     assert all(install_command("mlflow") in line and "tracking=none" in line for line in said)
@@ -75,10 +72,9 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_and_pictures(tmp_path
     monkeypatch.chdir(tmp_path)  # what mlflow writes where it stands would be found here
     for _ in range(2):  # the second time as after a restart: everything is found again
         tracker = Tracker(TrackingOptions(), Path("runs"), "tau", said.append, multirun="tau 1234")
-        tracker.update(good)
-        tracker.update(bad)
+        tracker.add(good)
+        tracker.add(bad)
         tracker.finish(["ok", "nan"], 2)
-        log(good, [40])
     client = mlflow.MlflowClient(f"sqlite:///{runs / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("tau")
     stored = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
@@ -89,69 +85,39 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_and_pictures(tmp_path
     assert run.data.tags["mlflow.parentRunId"] == parent.info.run_id
     assert (run.info.status, stored["room_padgs_2"].info.status, parent.info.status) == ("FINISHED", "FAILED", "FAILED")
     history = client.get_metric_history(run.info.run_id, "train/loss")
-    assert sorted(point.step for point in history) == [10, 20, 30, 40]
+    assert sorted(point.step for point in history) == [10, 20, 30]
     artifacts = {item.path for folder in ("", "renders") for item in client.list_artifacts(run.info.run_id, folder)}
     assert {"result.json", "renders/000.png"} <= artifacts
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
-
-
-@NEEDS_MLFLOW
-def test_a_run_that_is_started_again_begins_anew_and_a_broken_multirun_did_not_finish(tmp_path, said):
-    mlflow = pytest.importorskip("mlflow")
-    run = make_run(tmp_path, status="nan")
-    tracker = Tracker(TrackingOptions(), tmp_path, "tau", said.append, multirun="tau 1234")
-    tracker.update(run)
-    (run / "result.json").unlink()
-    (run / "log.jsonl").unlink()
-    log(run, [10, 20])
-    tracker.update(run)
-    tracker.update(run)
-    tracker.finish([], 1)
-    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
-    stored = client.search_runs([client.get_experiment_by_name("tau").experiment_id], order_by=["start_time"])
-    assert [(stored.info.run_name, stored.info.status) for stored in stored] == [
-        ("tau 1234", "KILLED"), ("room_padgs_1", "FAILED"), ("room_padgs_1", "RUNNING")
-    ]  # fmt: skip
-    history = client.get_metric_history(stored[-1].info.run_id, "train/loss")
-    assert [point.step for point in history] == [10, 20] and said == []
-
-
-@NEEDS_MLFLOW
-def test_a_server_that_is_away_costs_a_line(tmp_path, said):
-    pytest.importorskip("mlflow")
-    tracker = Tracker(TrackingOptions(uri="http://127.0.0.1:9"), tmp_path, "tau", said.append)
-    run = make_run(tmp_path)
-    for _ in range(3):
-        tracker.update(run)
-    assert len(said) == 1 and "no longer mirrored into mlflow at http://127.0.0.1:9" in said[0]
-    assert results.read(run / "result.json").ok
-
-
-@NEEDS_MLFLOW
-def test_a_database_that_is_lost_costs_a_line(tmp_path, said):
-    pytest.importorskip("mlflow")
-    tracker = Tracker(TrackingOptions(), tmp_path, "tau", said.append)
-    run = make_run(tmp_path)
-    tracker.update(run)
-    (tmp_path / "mlflow.db").write_text("no database any more")
-    tracker.update(run)
-    tracker.update(run)
+    results.write(replace(results.read(bad / "result.json"), status="ok", finished="later"), bad)
+    tracker.add(bad)  # it was started again: the failed attempt stays
+    again = client.search_runs([experiment.experiment_id], "tags.`padgs.run` = 'room_padgs_2'")
+    assert sorted(run.info.status for run in again) == ["FAILED", "FINISHED"]
+    (runs / "mlflow.db").write_text("no database any more")
+    results.write(replace(results.read(good / "result.json"), finished="later"), good)
+    tracker.add(good)
+    tracker.add(good)
     assert len(said) == 1 and "padgs track" in said[0]
 
 
 @NEEDS_MLFLOW
-def test_a_lock_that_is_never_free_costs_a_line(tmp_path, said, monkeypatch):
+def test_a_server_that_is_away_and_a_lock_that_is_never_free_cost_a_line(tmp_path, said, monkeypatch):
     pytest.importorskip("mlflow")
+    run = make_run(tmp_path)
+    tracker = Tracker(TrackingOptions(uri="http://127.0.0.1:9"), tmp_path, "tau", said.append)
+    for _ in range(3):
+        tracker.add(run)
+    assert len(said) == 1 and "no longer mirrored into mlflow at http://127.0.0.1:9" in said[0]
     monkeypatch.setattr(tracking, "PATIENCE", 0.1)
     with FileLock(tmp_path / ".mlflow.lock"):
-        Tracker(TrackingOptions(), tmp_path, "tau", said.append).update(make_run(tmp_path))
-    assert len(said) == 1 and "Timeout" in said[0]
+        Tracker(TrackingOptions(), tmp_path, "tau", said.append).add(run)
+    assert len(said) == 2 and "Timeout" in said[1] and results.read(run / "result.json").ok
 
 
 def test_a_folder_of_a_run_is_mirrored_whatever_its_name(tmp_path, monkeypatch):
     make_run(tmp_path).rename(tmp_path / "the best")
     mirrored = []
-    fake = SimpleNamespace(name="tau", on=True, update=mirrored.append)
+    fake = SimpleNamespace(name="tau", on=True, add=mirrored.append)
     monkeypatch.setattr(tracking, "Tracker", lambda *_: fake)
     done = CliRunner().invoke(app, ["track", str(tmp_path)])
     assert done.exit_code == 0 and mirrored == [tmp_path / "the best"]
@@ -176,7 +142,3 @@ def test_runs_of_a_cluster_are_mirrored_later(tmp_path, monkeypatch):
     assert list(Path.cwd().iterdir()) == []
     away = CliRunner().invoke(app, ["track", str(tmp_path), "--uri", "http://127.0.0.1:9"])
     assert away.exit_code == 1 and "no longer mirrored" in away.output
-
-
-def test_batches_hold_everything_once():
-    assert list(batches(range(5), 2)) == [range(0, 2), range(2, 4), range(4, 5)]

@@ -13,9 +13,8 @@ from support.tiny_scene import tiny_scene
 import padgs
 from padgs import results
 from padgs.baselines import METHODS
-from padgs.checks import ConfigError
+from padgs.checks import ConfigError, lookup
 from padgs.multirun.composition import composing, configuration
-from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.run import Callback, load_scene, run

@@ -7,10 +7,10 @@ from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
 from torch import Tensor
 
 from padgs.baselines import METHODS
+from padgs.checks import lookup
 from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
-from padgs.registry import lookup
 from padgs.render import RenderConfig, Rendering
 from padgs.scene import View
 from padgs.training.health import FADE, EarlyStopping, quality, validation_split

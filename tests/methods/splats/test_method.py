@@ -8,8 +8,8 @@ from support.composed import composed
 from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
+from padgs.checks import lookup
 from padgs.multirun.composition import make_method
-from padgs.registry import lookup
 from padgs.training.options import Budget
 
 
