@@ -8,14 +8,16 @@ import typer
 
 from padgs.cli.errors import check_range, show
 
-FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, roam360, ricoh360, omniblender, released"
+FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
 
 
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
     to: Annotated[str, typer.Option(help=f"the format to write: {FORMATS}")],
-    format: Annotated[str, typer.Option(help="format of the source: auto, or one of these")] = "auto",
+    format: Annotated[
+        str, typer.Option(help="format of the source: auto, one of these, roam360, ricoh360 or omniblender")
+    ] = "auto",
     width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
     points: Annotated[str, typer.Option(help="auto, random, or a PLY file in the source's folder")] = "auto",
     mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",

@@ -20,12 +20,12 @@ LOADERS = {
     "colmap": "padgs.data.formats.colmap:read",
     "transforms": "padgs.data.formats.transforms:read",
     "nerfstudio": "padgs.data.formats.transforms:read",  # an alias of transforms
-    "openmvg": "padgs.data.formats.openmvg:read",
-    "opensfm": "padgs.data.formats.opensfm:read",
+    "openmvg": "padgs.data.formats.reconstructions:read_openmvg",
+    "opensfm": "padgs.data.formats.reconstructions:read_opensfm",
     "roam360": "padgs.data.formats.published:read_roam360",
     "ricoh360": "padgs.data.formats.published:read_ricoh360",
     "omniblender": "padgs.data.formats.published:read_omniblender",
-    "released": "padgs.data.formats.published:read_released",
+    "released": "padgs.data.formats.reconstructions:read_released",
     "synthetic": "padgs.data.synthetic:load",
 }
 

@@ -93,6 +93,11 @@ class Tracks:
         frame, point = torch.from_numpy(ids[finite := np.isfinite(pixels).all(1)].T.copy())
         return cls(frame, point, torch.from_numpy(pixels[finite]))
 
+    def thinned(self, count: int) -> Tracks:
+        """Return about `count` observations, evenly spaced."""
+        some = slice(None, None, max(1, len(self.frame) // count))
+        return Tracks(self.frame[some], self.point[some], self.pixels[some])
+
 
 @dataclass(frozen=True)
 class Capture:

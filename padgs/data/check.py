@@ -16,7 +16,14 @@ import padgs.data
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
 from padgs.data.capture import Capture, DataError, DataOptions, listed
-from padgs.data.conventions import VIEWS, colour_fit, exposure_gains, known_conventions, reprojection_error, track_fit
+from padgs.data.conventions import (
+    POINTS,
+    VIEWS,
+    colour_fit,
+    exposure_gains,
+    known_conventions,
+    reprojection_errors,
+)
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.store import area_resize
 from padgs.geometry.panorama import project
@@ -185,10 +192,8 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     width, height = next(iter(sizes))
     if tracks is not None and len(tracks.frame) and len(sizes) == 1 and width is not None and height is not None:
         assert capture.cloud is not None
-        poses = torch.stack([frame.cam_from_world for frame in capture.frames])
-        pose, points = poses[tracks.frame], capture.cloud.points[tracks.point]
-        seen = (pose[:, :3, :3] @ points[..., None])[..., 0] + pose[:, :3, 3]
-        error = reprojection_error(seen, tracks.pixels, width, height)
+        poses, points = torch.stack([frame.cam_from_world for frame in capture.frames]), capture.cloud.points
+        error = reprojection_errors(poses, points, tracks, width, height)
         report.observations = len(error)
         report.reprojection_median = error.median().item()
         report.reprojection_95 = error.sort().values[int(0.95 * (len(error) - 1))].item()
@@ -198,9 +203,11 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
                 f"the median reprojection error is {report.reprojection_median:.1f} pixels; it must be at most "
                 f"{limit:.1f} at this size"
             )
-            fits = track_fit(poses, capture.cloud.points, tracks, width, height, conventions)
-            if max(fits) >= -limit:
-                report.suggestion = conventions[fits.index(max(fits))].words
+            some = tracks.thinned(POINTS)
+            candidates = (convention.convert(poses.double()) for convention in conventions)
+            errors = [reprojection_errors(pose, points, some, width, height).median().item() for pose in candidates]
+            if min(errors) <= limit:
+                report.suggestion = conventions[errors.index(min(errors))].words
     # A few points, or points of one colour, correlate with anything or nothing.
     compared = report.coloured and report.points >= MIN_POINTS and scene.point_colors.float().std(0).max() >= 1
     if not (compared or report.observations):
@@ -213,11 +220,10 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         return
     views = (*scene.train, *scene.test)
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
-    poses = move_origin(
-        torch.stack([view.cam_from_world for view in views]), -scene.origin
-    )  # in the world of the data set
-    points = scene.points.double() + scene.origin
-    fits = colour_fit(poses, _small(views), points, scene.point_colors, conventions)
+    # In the world of the data set.
+    poses = move_origin(torch.stack([view.cam_from_world for view in views]), -scene.origin).double()
+    points, images = scene.points.double() + scene.origin, _small(views)
+    fits = [colour_fit(known.convert(poses), images, points, scene.point_colors) for known in conventions]
     stated, best = fits[0], max(fits)
     report.colour_correlation = stated
     if best > max(MIN_CORRELATION, stated + MIN_GAIN) and report.suggestion is None:

@@ -7,7 +7,7 @@ strongly only if axes, handedness and direction of the poses are right, even if 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -29,56 +29,41 @@ class Convention(NamedTuple):
     convert: Callable[[Tensor], Tensor]  # stated poses [F, 4, 4] -> cam_from_world [F, 4, 4]
 
 
-def colour_fit(
-    poses: Tensor, images: Tensor, points: Tensor, colors: Tensor, conventions: Sequence[Convention]
-) -> list[float]:
-    """Return the correlation of point and pixel colours under each convention; 1 = equal, about 0 = unrelated.
+def colour_fit(poses: Tensor, images: Tensor, points: Tensor, colors: Tensor) -> float:
+    """Return the correlation of point and pixel colours; 1 = equal, about 0 = unrelated.
 
     Args:
         poses: [F, 4, 4] cam_from_world.
         images: [F, H, W, 3] uint8, panoramas reduced to a few hundred pixels width.
         points: [P, 3] world.
         colors: [P, 3] uint8.
-        conventions: candidates.
     """
-    step = max(1, len(points) // POINTS)
-    points, colors = points[::step].double(), colors[::step].float()
+    found = _pixels(poses, images, points)
+    colors = colors[:: max(1, len(points) // POINTS)].float().expand_as(found)
+    a, b = (values - values.mean(1, keepdim=True) for values in (found, colors))
+    return ((a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1)).clamp(min=1e-6)).mean().item()
+
+
+def _pixels(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
+    """Return the pixels [F, P, 3] float where the images show the points, of which at most about `POINTS` are used."""
+    points = points[:: max(1, len(points) // POINTS)].double()
     height, width = images.shape[1:3]
-    frame = torch.arange(len(images))[:, None]
-    fits = []
-    for convention in conventions:
-        pose = convention.convert(poses.double())
-        seen = (points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]).float()
-        column, row = project(seen, width, height).long().unbind(-1)
-        found = images[frame, row.clamp(0, height - 1), column % width].float()
-        fits.append(_correlation(found, colors.expand_as(found)).mean().item())
-    return fits
+    seen = (points @ poses[:, :3, :3].double().mT + poses[:, None, :3, 3].double()).float()
+    column, row = project(seen, width, height).long().unbind(-1)
+    return images[torch.arange(len(images))[:, None], row.clamp(0, height - 1), column % width].float()
 
 
-def track_fit(
-    poses: Tensor, points: Tensor, tracks: Tracks, width: int, height: int, conventions: Sequence[Convention]
-) -> list[float]:
-    """Return the negative median reprojection error under each convention, in pixels of width x height."""
-    step = max(1, len(tracks.frame) // POINTS)
-    frame, point, pixels = tracks.frame[::step], tracks.point[::step], tracks.pixels[::step]
-    some = points[point].double()
-    fits = []
-    for convention in conventions:
-        pose = convention.convert(poses.double())[frame]
-        error = reprojection_error((pose[:, :3, :3] @ some[..., None])[..., 0] + pose[:, :3, 3], pixels, width, height)
-        fits.append(-error.median().item())
-    return fits
-
-
-def reprojection_error(points: Tensor, pixels: Tensor, width: int, height: int) -> Tensor:
-    """Return the reprojection errors [T] of camera-frame points [T, 3] observed at pixels [T, 2].
+def reprojection_errors(poses: Tensor, points: Tensor, tracks: Tracks, width: int, height: int) -> Tensor:
+    """Return the reprojection errors [T] of points [P, 3] seen from poses [F, 4, 4], in pixels of width x height.
 
     Errors wrap around the seam, and are scaled by the cosine of the latitude along rows, so that a pixel is the same
     angle everywhere.
     """
-    difference = project(points, width, height) - pixels
+    pose = poses.double()[tracks.frame]
+    seen = (pose[:, :3, :3] @ points[tracks.point].double()[..., None])[..., 0] + pose[:, :3, 3]
+    difference = project(seen, width, height) - tracks.pixels
     along = (difference[:, 0] + width / 2) % width - width / 2
-    along = along * torch.cos((pixels[:, 1] / height - 0.5) * torch.pi)
+    along = along * torch.cos((tracks.pixels[:, 1] / height - 0.5) * torch.pi)
     return torch.hypot(along, difference[:, 1])
 
 
@@ -146,12 +131,6 @@ def _with(poses: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
     return out
 
 
-def _correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Return Pearson's correlation over P of two [F, P, 3]; [F, 3]."""
-    a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
-    return (a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1)).clamp(min=1e-6)
-
-
 DARKEST, BRIGHTEST = 8, 250  # pixel values that are not clipped
 ROUNDS = 10  # of alternating medians, until convergence
 
@@ -162,16 +141,9 @@ def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
     A doubling is about two stops of light in sRGB. A pixel is modelled as the gain of its view times the brightness of
     its point; both are alternating medians, robust to hidden and shiny points.
 
-    Args:
-        poses: [F, 4, 4] cam_from_world.
-        images: [F, H, W, 3] uint8, panoramas reduced to a few hundred pixels width.
-        points: [P, 3] world.
+    Arguments are those of `colour_fit`.
     """
-    points = points[:: max(1, len(points) // POINTS)].double()
-    height, width = images.shape[1:3]
-    seen = points @ poses[:, :3, :3].double().mT + poses[:, None, :3, 3].double()
-    column, row = project(seen, width, height).long().unbind(-1)
-    pixels = images[torch.arange(len(images))[:, None], row.clamp(0, height - 1), column % width].float()
+    pixels = _pixels(poses, images, points)
     usable = (pixels.mean(-1) >= DARKEST) & (pixels.amax(-1) <= BRIGHTEST)
     brightness = torch.where(usable, pixels.mean(-1).log2(), torch.nan)  # [F, P]
     gains = brightness.new_zeros(len(brightness))

@@ -83,7 +83,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
         frames=frames,
         cloud=points.cloud,
         tracks=lambda: _tracks(images, points.row_of),
-        notes=(*notes, *_frame_notes(model, files["images"], images, frames)),
+        notes=(*notes, *_frame_notes(model, files["images"], images)),
     )
 
 
@@ -118,20 +118,21 @@ def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) 
     return notes
 
 
-def _frame_notes(model: Path, file: Path, images: list[Image], frames: tuple[Frame, ...]) -> list[str]:
-    """Say where the poses of frames and rigs differ from those of the images file."""
-    names, stated = read_frames(model)
+def _frame_notes(model: Path, file: Path, images: list[Image]) -> list[str]:
+    """Say where the poses of frames.bin (COLMAP 4) differ from those of the images file."""
+    frames = read_frames(model / "frames.bin") if (model / "frames.bin").is_file() else {}
+    flip = np.array([-1, -1, -1, -1, 1, 1, 1])  # a quaternion and its negative are one rotation
     differing = [
-        frame.name
-        for image, frame in zip(images, frames, strict=True)
-        if image.id not in stated or not np.allclose(stated[image.id], frame.cam_from_world, rtol=1e-6, atol=1e-6)
+        image.name
+        for image in images
+        if (stated := frames.get(image.id))
+        and not any(np.allclose(stated, sign * np.array(image.pose), 1e-6, 1e-6) for sign in (1, flip))
     ]
-    if not names or not (differing or len(stated) > len(images)):
+    if not differing:
         return []
-    where = listed(differing) or f"{len(stated)} images, not {len(images)}"
     return [
-        f"{' and '.join(names)} state other poses than {file.name} ({where}); those of {file.name} are used: remove "
-        "the files that are out of date"
+        f"frames.bin states other poses than {file.name} ({listed(differing)}); those of {file.name} are used: remove "
+        "the file that is out of date"
     ]
 
 

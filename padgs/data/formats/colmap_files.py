@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,11 +14,9 @@ from numpy.typing import NDArray
 
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import color_bytes, whole_if_possible
-from padgs.data.formats.poses import FARTHEST
 from padgs.data.images import read_bytes
 from padgs.data.splits import read_lines
 
-SENSORS = {"CAMERA": "0", "IMU": "1"}  # text -> binary
 NO_POINT = -1  # point of an observation without one
 FILES = ("cameras", "images", "points3D")
 PANORAMIC = ("EQUIRECTANGULAR", "SPHERICAL", "SPHERE")
@@ -143,44 +140,14 @@ def read_points(file: Path) -> Points:
     return Points({row[0]: i for i, row in enumerate(rows)}, cloud, frozenset(seen_by))
 
 
-def read_frames(model: Path) -> tuple[list[str], dict[int, NDArray[np.float64]]]:
-    """Read the poses that frames and rigs (COLMAP 4) state beside those of the images file.
+def read_frames(file: Path) -> dict[int, tuple[float, ...]]:
+    """Read frames.bin of COLMAP 4: image id -> pose as in `Image`, for the frames of a single image."""
 
-    Returns:
-        The names of the files that are there, and image id -> cam_from_world [4, 4].
-    """
-    from scipy.spatial.transform import Rotation
+    def entry(cursor: _Cursor) -> tuple[tuple[float, ...], list[int]]:
+        _, _, *pose, count = cursor.take("II7dI")
+        return tuple(pose), [cursor.take("iIQ")[2] for _ in range(count)]
 
-    def matrix(pose: Sequence[float]) -> NDArray[np.float64]:
-        found = np.eye(4)
-        if 0.4 < np.abs(pose[:4]).max() < 2 and np.abs(pose).max() < FARTHEST:  # else it agrees with no image
-            found[:3, :3], found[:3, 3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:]
-        return found
-
-    def rig(cursor: _Cursor | _Words) -> tuple[int, dict[tuple[int, int], NDArray[np.float64] | None]]:
-        key, count = cursor.take("II")
-        sensors = {}  # type and id -> sensor_from_rig
-        for number in range(count):
-            sensor = cursor.take("iI")
-            has_pose = number and cursor.take("B")[0]
-            sensors[sensor] = matrix(cursor.take("7d")) if has_pose else None if number else np.eye(4)
-        return key, sensors
-
-    def frame(cursor: _Cursor | _Words) -> tuple[int, NDArray[np.float64], list[tuple[int, int, int]]]:
-        _, key, *pose, count = cursor.take("II7dI")
-        return key, matrix(pose), [cursor.take("iIQ") for _ in range(count)]
-
-    files = [file for stem in ("rigs", "frames") if (file := find_file(model, stem))]
-    if len(files) < 2:
-        return [], {}
-    rigs = dict(_entries(files[0], rig))
-    poses = {}
-    for key, rig_from_world, data in _entries(files[1], frame):
-        for kind, sensor, image in data:
-            sensor_from_rig = rigs.get(key, {}).get((kind, sensor))
-            if kind == 0 and sensor_from_rig is not None:
-                poses[image] = sensor_from_rig @ rig_from_world
-    return [file.name for file in files], poses
+    return {images[0]: pose for pose, images in _entries(file, entry) if len(images) == 1}
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
@@ -232,32 +199,12 @@ class _Cursor:
         return np.frombuffer(whole, dtype)
 
 
-class _Words:
-    """Position in a line of a text file, with the layouts of `_Cursor`."""
-
-    def __init__(self, line: str) -> None:
-        self.words = iter(line.split())
-
-    def take(self, layout: str) -> tuple[Any, ...]:
-        kinds = layout.replace("7d", 7 * "d")
-        words = [SENSORS.get(word, word) for word in islice(self.words, len(kinds))]
-        return tuple(float(word) if kind == "d" else int(word) for kind, word in zip(kinds, words, strict=True))
-
-
-def _entries(file: Path, entry: Callable[[Any], T]) -> list[T]:
-    """Read the entries of a binary file, or the lines of a text file.
+def _entries(file: Path, entry: Callable[[_Cursor], T]) -> list[T]:
+    """Read the entries of a binary file.
 
     Raises:
         DataError: the file is truncated, or longer than its entries.
     """
-    if file.suffix == ".txt":
-        found = []
-        for number, line in _lines(file):
-            try:
-                found.append(entry(_Words(line)))
-            except ValueError as error:
-                raise DataError(f"{file}, line {number} is not an entry ({error}); export the model again") from error
-        return found
     cursor = _Cursor(file)
     try:
         (count,) = cursor.take("Q")

@@ -19,9 +19,6 @@ from padgs.data.masks import write_masks
 from padgs.files import draft_of
 from padgs.scene import Scene
 
-IMAGE_FOLDERS = {"ricoh360": "imgs"}  # default: images
-PNG_ONLY = ("ricoh360",)  # EgoNeRF appends .png to the names in its lists
-
 
 def convert(
     source: Path,
@@ -34,8 +31,8 @@ def convert(
 ) -> Scene:
     """Write a data set in another format.
 
-    Images are copied byte for byte, unless they are reduced (`options.width`) or the format requires PNG. The split is
-    written as decided; masks, including the row rule of 360Roam, become mask.png or masks/.
+    Images are copied byte for byte, unless they are reduced (`options.width`), padded or converted to sRGB. The split
+    is written as decided; masks, including the row rule of 360Roam, become mask.png or masks/.
 
     Args:
         source: a data set in any known format.
@@ -62,11 +59,10 @@ def convert(
         destination.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(destination) as partial:
             partial.mkdir()
-            content = _write_images(capture, scene, partial, to, progress)
+            content = _write_images(capture, scene, partial / "images", progress)
             if options.points != "auto":
-                points, colors, _ = initial_cloud(
-                    capture, options.points
-                )  # where the poses are: the scene may be recentered
+                # In the world of the poses: the scene may be recentered.
+                points, colors, _ = initial_cloud(capture, options.points)
                 content = replace(content, cloud=Cloud(points, colors), tracks=None)
             write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
             WRITERS[to](content, partial)
@@ -78,12 +74,9 @@ def convert(
     return scene
 
 
-def _write_images(
-    capture: Capture, scene: Scene, folder: Path, to: str, progress: Callable[[int, int], None]
-) -> Content:
+def _write_images(capture: Capture, scene: Scene, target: Path, progress: Callable[[int, int], None]) -> Content:
     """Copy or re-encode the images, and return the content of the files beside them."""
     views = {view.name: view for view in (*scene.train, *scene.test)}
-    target = folder / IMAGE_FOLDERS.get(to, "images")
     frames: list[Frame] = []
     renamed: dict[str, str] = {}  # view name -> new frame name
     kept = [i for i, frame in enumerate(capture.frames) if view_name(frame.name) in views]
@@ -92,9 +85,8 @@ def _write_images(
         view = views[view_name(frame.name)]
         image = inspect(frame.image)
         changed = image.width != view.width or image.crop is not None or image.converted
-        encode = changed or (to in PNG_ONLY and frame.image.suffix.lower() != ".png")
-        name = str(PurePosixPath(frame.name).with_suffix(".png")) if encode else frame.name
-        if encode:
+        name = str(PurePosixPath(frame.name).with_suffix(".png")) if changed else frame.name
+        if changed:
             assert view.load_pixels is not None
             save_png(view.load_pixels(), target / name)
         else:

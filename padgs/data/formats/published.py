@@ -1,4 +1,4 @@
-"""Readers of published data sets: 360Roam, Ricoh360, OmniBlender, and the folders of released PaD-GS and ODGS code.
+"""Readers of published data sets: 360Roam, Ricoh360 and OmniBlender.
 
 360Roam: images/, `pose_c2w.json` (world from camera, OpenCV axes; includes the split) and scene.ply. Images of
 6080 x 3040 are reduced to the paper's 2048 x 1024 unless data.width is set; the bottom rows (tripod) are masked.
@@ -8,9 +8,6 @@ with a camera unknown to COLMAP, so they are parsed here. Their names may differ
 
 OmniBlender (EgoNeRF): `transform.json`, images/, train.txt, test.txt; no points. Poses are world from camera, with
 OpenGL axes, in Blender's z-up world.
-
-Released PaD-GS and ODGS: images/, data_views.json, data_extrinsics.json, pcd.ply (or colorized.ply), train.txt and
-test.txt. Views and extrinsics are joined by key; sizes are those of the images.
 """
 
 from __future__ import annotations
@@ -24,7 +21,6 @@ from padgs.data.datasets import DATASETS
 from padgs.data.formats.colmap import pose_of
 from padgs.data.formats.colmap_files import read_images, read_points
 from padgs.data.formats.json_file import Json, file_in, read_json
-from padgs.data.formats.openmvg import read_extrinsics, read_views
 from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose
 from padgs.data.splits import check_name
 
@@ -88,12 +84,3 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
         pose = cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
     return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, _OMNIBLENDER_CLOUDS))
-
-
-def read_released(path: Path, options: DataOptions) -> Capture:
-    """Read a folder of the released PaD-GS or ODGS code."""
-    views = read_views(read_json(path / "data_views.json"))
-    poses = read_extrinsics(read_json(path / "data_extrinsics.json"))
-    images = image_folder(path, options.images)
-    frames = tuple(Frame(view.name, images / view.name, poses[view.key]) for view in views if view.key in poses)
-    return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply")))

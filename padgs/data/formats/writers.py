@@ -63,8 +63,10 @@ def write_transforms(content: Content, folder: Path) -> None:
     frames = []
     for frame in content.frames:
         width, height = _size(frame)
-        pose = _opengl_pose(frame)
-        frames.append({"file_path": f"images/{frame.name}", "w": width, "h": height, "transform_matrix": pose})
+        pose = torch.linalg.inv(frame.cam_from_world)
+        pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_OPENGL
+        frame_size = {"w": width, "h": height}
+        frames.append({"file_path": f"images/{frame.name}", **frame_size, "transform_matrix": pose.tolist()})
     meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
     if content.cloud is not None:
         write_ply(folder / "sparse_pc.ply", content.cloud)
@@ -127,62 +129,13 @@ def write_opensfm(content: Content, folder: Path) -> None:
     _write_lists(content, folder)
 
 
-def write_roam360(content: Content, folder: Path) -> None:
-    """Write `pose_c2w.json` and scene.ply. The format cannot hold unused views."""
-    if not content.split:
-        raise DataError("360Roam's format needs test views, and there are none; set data.split to every or files")
-    frames = {frame.name: frame for frame in content.frames}
-    poses = {
-        side: [
-            {"rgb_file": name, "transform_matrix": torch.linalg.inv(frames[name].cam_from_world).tolist()}
-            for name in content.split[side]
-        ]
-        for side in ("train", "test")
-    }
-    _write_json(folder / "pose_c2w.json", poses)
-    _write_cloud(content, folder / "scene.ply")
-
-
-def write_ricoh360(content: Content, folder: Path) -> None:
-    """Write COLMAP text files to output_dir/colmap, and the lists (without extensions)."""
-    from scipy.spatial.transform import Rotation
-
-    model = folder / "output_dir" / "colmap"
-    model.mkdir(parents=True)
-    width, height = _size(content.frames[0])
-    header = "# written by padgs\n# in the layout of\n# EgoNeRF's Ricoh360\n#\n"
-    (model / "cameras.txt").write_text(f"{header}0 SPHERICAL {width} {height}\n", encoding="utf-8")
-    with (model / "images.txt").open("w", encoding="utf-8") as file:
-        file.write(header)
-        for i, frame in enumerate(content.frames):
-            x, y, z, w = Rotation.from_matrix(frame.cam_from_world[:3, :3].numpy()).as_quat(canonical=True).tolist()
-            pose = " ".join(repr(value) for value in [w, x, y, z, *frame.cam_from_world[:3, 3].tolist()])
-            file.write(f"{i} {pose} 0 {frame.name}\n\n")
-    with (model / "points3D.txt").open("w", encoding="utf-8") as file:
-        file.write(header)
-        if content.cloud is not None:
-            colors = _colors(content.cloud).tolist()
-            for k, (point, color) in enumerate(zip(content.cloud.points.tolist(), colors, strict=True)):
-                file.write(" ".join([str(k), *map(repr, point), *map(str, color), "0"]) + "\n")
-    _write_lists(content, folder, extensions=False)
-
-
-def write_omniblender(content: Content, folder: Path) -> None:
-    """Write `transform.json`, the lists, and pcd.ply, which EgoNeRF's scenes lack."""
-    width, height = _size(content.frames[0])
-    frames = [{"file_path": frame.name, "transform_matrix": _opengl_pose(frame)} for frame in content.frames]
-    meta = {"indoor": False, "width": width, "height": height, "frames": frames}
-    _write_json(folder / "transform.json", meta)
-    _write_cloud(content, folder / "pcd.ply")
-    _write_lists(content, folder, extensions=False)
-
-
 def write_released(content: Content, folder: Path) -> None:
     """Write data_views.json, data_extrinsics.json, pcd.ply and the lists (without extensions)."""
     views, extrinsics = _mvg_views(content)
     _write_json(folder / "data_views.json", {"views": views})
     _write_json(folder / "data_extrinsics.json", {"extrinsics": extrinsics})
-    _write_cloud(content, folder / "pcd.ply")
+    if content.cloud is not None:
+        write_ply(folder / "pcd.ply", content.cloud)
     _write_lists(content, folder, extensions=False)
 
 
@@ -192,9 +145,6 @@ WRITERS: dict[str, Callable[[Content, Path], None]] = {
     "nerfstudio": write_transforms,
     "openmvg": write_openmvg,
     "opensfm": write_opensfm,
-    "roam360": write_roam360,
-    "ricoh360": write_ricoh360,
-    "omniblender": write_omniblender,
     "released": write_released,
 }
 
@@ -213,12 +163,6 @@ def _mvg_views(content: Content) -> tuple[list[dict[str, Any]], list[dict[str, A
     return views, extrinsics
 
 
-def _opengl_pose(frame: Frame) -> list[list[float]]:
-    pose = torch.linalg.inv(frame.cam_from_world)
-    pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_OPENGL
-    return pose.tolist()
-
-
 def _size(frame: Frame) -> tuple[int, int]:
     assert frame.width is not None and frame.height is not None
     return frame.width, frame.height
@@ -227,11 +171,6 @@ def _size(frame: Frame) -> tuple[int, int]:
 def _colors(cloud: Cloud) -> Any:
     colors = torch.full((len(cloud.points), 3), 128, dtype=torch.uint8) if cloud.colors is None else cloud.colors
     return colors.numpy()
-
-
-def _write_cloud(content: Content, path: Path) -> None:
-    if content.cloud is not None:
-        write_ply(path, content.cloud)
 
 
 def _write_json(path: Path, value: Any) -> None:

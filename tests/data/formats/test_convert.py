@@ -19,7 +19,7 @@ from padgs.data.formats.convert import convert
 from padgs.scene import Scene
 
 
-@pytest.mark.parametrize("to", WRITERS)
+@pytest.mark.parametrize("to", [to for to in writers.WRITERS if to != "nerfstudio"])
 @pytest.mark.parametrize("source", WRITERS)
 def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
     """Convert a data set written by hand, and compare both as loaded."""
@@ -30,7 +30,7 @@ def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out put"]
     scene, truth = load(tmp_path / "out put"), load(tmp_path / "in")
     assert scene.notes[0].startswith(f"format: {to}")
-    _same(scene, truth, world, pixels=not (source == "roam360" and to == "ricoh360"))
+    _same(scene, truth, world)
 
 
 @pytest.mark.parametrize("points", ["mine.ply", "random"])
@@ -95,9 +95,9 @@ def test_nested_images(world: World, tmp_path: Path) -> None:
         text = text.replace(f"images/{name}.png", f"images/{folder}/{name}.png")
     (tmp_path / "a" / "transforms.json").write_text(text)
     convert(tmp_path / "a", tmp_path / "b", "colmap")
-    convert(tmp_path / "b", tmp_path / "c", "ricoh360")
-    names = {view.name for view in (lambda scene: (*scene.train, *scene.test))(load(tmp_path / "c"))}
-    assert {"eins/pano_00", "zwei ü/pano_01"} <= {name.removeprefix("images/") for name in names}
+    convert(tmp_path / "b", tmp_path / "c", "released")
+    scene = load(tmp_path / "c")
+    assert {"eins/pano_00", "zwei ü/pano_01"} <= {view.name.removeprefix("images/") for view in (*scene.train, *scene.test)}
 
 
 def test_a_full_disk_leaves_no_files(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,12 +136,11 @@ def test_convert_refuses_invalid_calls(world: World, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["full", "in"]
 
 
-def _same(scene: Scene, truth: Scene, world: World, pixels: bool = True) -> None:
+def _same(scene: Scene, truth: Scene, world: World) -> None:
     assert [view.name for view in scene.train] == list(world.train)
     assert [view.name for view in scene.test] == list(world.test)
     for view, expected in zip((*scene.train, *scene.test), (*truth.train, *truth.test), strict=True):
         torch.testing.assert_close(view.cam_from_world, expected.cam_from_world, atol=1e-12, rtol=0)
-        if pixels:
-            assert torch.equal(view.load_pixels(), expected.load_pixels())  # type: ignore[misc]
+        assert torch.equal(view.load_pixels(), expected.load_pixels())  # type: ignore[misc]
     assert torch.equal(scene.points, truth.points)
     assert torch.equal(scene.point_colors, truth.point_colors)

@@ -1,7 +1,7 @@
 """Malformed JSON files are read, or refused by a DataError that names the position."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -35,14 +35,25 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(value[key], (*at, key))
 
 
+GONE = object()
+
+
 def changed(document: Any, at: tuple[Any, ...], value: Any) -> Any:
+    """Return a copy with another value at a position: removed, or a function of what is there."""
     if not at:
         return value
     document = inner = deepcopy(document)
     for key in at[:-1]:
         inner = inner[key]
-    inner[at[-1]] = value
+    inner[at[-1]] = value(inner[at[-1]]) if callable(value) else value
+    if value is GONE:
+        del inner[at[-1]]
     return document
+
+
+def times(*factors: float) -> Callable[[list[list[float]]], list[list[float]]]:
+    """Return a change that scales the axes of a pose."""
+    return lambda pose: [[f * x for f, x in zip((*factors, 1), row, strict=True)] for row in pose]
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -62,17 +73,41 @@ def test_values_of_other_types_raise_data_errors(name: str, small: World, tmp_pa
     assert refused > 10
 
 
-WRONG = [
-    ("transforms", ("w",), 0, "the camera of pano_00.png is 0x8; a full panorama is 2:1"),
-    ("transforms", ("w",), float("inf"), "w of .*transforms.json is inf; it must be a whole number"),
+POSE = ("frames", 3, "transform_matrix")
+LIST = ("test_filenames", 1)
+WRONG: list[tuple[str, tuple[Any, ...], Any, str]] = [
+    ("transforms", ("camera_model",), "OPENCV_FISHEYE", "'OPENCV_FISHEYE'; only EQUIRECTANGULAR"),
+    ("transforms", ("camera_model",), GONE, "camera_model None"),
+    ("transforms", ("frames",), GONE, "lacks the field 'frames'; it has camera_model, w, h"),
+    ("transforms", POSE, GONE, "pano_03.png .* lacks the field 'transform_matrix'"),
+    ("transforms", (*POSE, 0, 3), float("nan"), "pano_03.png .*contains nan"),
+    ("transforms", (*POSE, 0, 3), 1e300, r"contains 1e\+300; nothing farther"),
+    ("transforms", POSE, times(2, 2, 2), "pano_03.png .* a rotation times 2; scale belongs"),
+    ("transforms", (*POSE, 0, 0), 3.0, "is not a rotation: R R"),
+    ("transforms", POSE, times(-1, 1, 1), "pano_03.png .*left-handed .*negate the column"),
+    ("transforms", POSE, lambda pose: [*map(list, zip(*pose, strict=True))], "the pose is transposed, its last row"),
+    ("transforms", (*POSE, 3, 3), 2, "must be 0 0 0 1"),
+    ("transforms", POSE, "identity", "not an array of numbers"),
+    ("transforms", (*POSE, 1), [1.0], "not an array of numbers"),
+    ("transforms", ("frames", 0, "file_path"), "../../secret.png", "names '../../secret.png'; names must be relative"),
     ("transforms", ("frames", 0, "file_path"), "x" * 300 + ".png", "file names have at most 255 bytes"),
     ("transforms", ("frames", 0, "file_path"), "\udce9.png", "which is not Unicode; rename the file"),
-    ("transforms", ("frames", 0, "transform_matrix", 0, 3), 1e300, r"contains 1e\+300; nothing farther"),
+    ("transforms", ("ply_file_path",), "/etc/passwd", "names '/etc/passwd'; names must be relative"),
+    ("transforms", ("ply_file_path",), "absent.ply", "the point cloud .*absent.ply does not exist"),
+    ("transforms", LIST, "images/x.png", "the test list names images .*: x.png"),
+    ("transforms", LIST, "images/pano_00.png", "overlap: pano_00.png"),
+    ("transforms", ("h",), 33, "the camera of pano_00.png is 16x33; a full panorama is 2:1"),
+    ("transforms", ("w",), 0, "the camera of pano_00.png is 0x8; a full panorama is 2:1"),
+    ("transforms", ("w",), float("inf"), "w of .*transforms.json is inf; it must be a whole number"),
     ("omniblender", ("width",), [], "width of .*transform.json must be a whole number, not list"),
     ("openmvg", ("structure",), 3, "structure of .*sfm_data.json must be a list, not int"),
     ("openmvg", ("structure", 0, "value", "X", 0), float("nan"), "1 of 3 points .*not finite"),
+    ("openmvg", ("intrinsics", 0, "value", "polymorphic_name"), "fisheye", "a 'fisheye' camera; only spherical"),
     ("opensfm", (1, "points"), 3, "points of entry 1 of .* must be an object, not int"),
     ("opensfm", (1, "points", "0", "color"), [float("nan")] * 3, "colour of point 0 of .* is not finite"),
+    ("opensfm", (1, "cameras", "v2 camera spherical", "projection_type"), "brown", "a 'brown' camera; only spherical"),
+    ("roam360", ("train", 0, "rgb_file"), "pano_01.jpg", "pano_01.jpg is both a train and a test view"),
+    ("released", ("views", 0, "value", "ptr_wrapper", "data", "filename"), "../else.png", "names '../else.png'; names"),
 ]
 
 
@@ -83,6 +118,18 @@ def test_errors_name_the_position(name: str, at, value, message: str, small: Wor
     file.write_text(json.dumps(changed(json.loads(file.read_text()), at, value)))
     with pytest.raises(DataError, match=message):
         load(tmp_path / "scene", name)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_that_are_not_json(name: str, small: World, tmp_path: Path) -> None:
+    WRITERS[name](small, tmp_path / "scene")
+    file = tmp_path / "scene" / FILES[name]
+    file.write_text(file.read_text()[:-40])
+    with pytest.raises(DataError, match=rf"{file.name} is not valid JSON \(.* line \d+"):
+        load(tmp_path / "scene")
+    file.write_text("{}" if name != "opensfm" else "[]")
+    with pytest.raises(DataError, match=rf"{file.name} (lacks the field|must hold)"):
+        load(tmp_path / "scene")
 
 
 def test_openmvg_cannot_reach_other_folders(small: World, tmp_path: Path) -> None:

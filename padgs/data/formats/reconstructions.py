@@ -1,0 +1,141 @@
+"""JSON files of structure from motion with spherical cameras, whose axes are those of `padgs.geometry.panorama`.
+
+OpenMVG: `sfm_data.json` with views, intrinsics, extrinsics (rotation cam_from_world, row-major, and camera centre) and
+structure. Released PaD-GS and ODGS code splits it: data_views.json, data_extrinsics.json, pcd.ply (or colorized.ply),
+train.txt and test.txt; image sizes are not stated. OpenSfM: `reconstruction.json` with the rotation vector and
+translation of cam_from_world in each shot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from torch import Tensor
+
+from padgs.data.assemble import image_folder
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
+from padgs.data.cloud import color_bytes, first_ply, whole_if_possible
+from padgs.data.formats.json_file import Json, file_in, read_json
+from padgs.data.formats.poses import cam_from_center, cam_from_world, rotation_from_vector
+from padgs.data.splits import check_name
+
+
+class MvgView(NamedTuple):
+    """An entry of OpenMVG's `views`."""
+
+    key: int
+    pose: int  # id_pose
+    name: str  # local_path/filename
+    size: tuple[int, int]  # width, height
+
+
+def read_openmvg(path: Path, options: DataOptions) -> Capture:
+    """Read `sfm_data.json`. Its points have no colours; a colorized.ply beside it is preferred."""
+    file = file_in(path, "sfm_data.json")
+    folder, data = file.parent, read_json(file)
+    for item in data["intrinsics"].entries():  # cereal names a class only where it first occurs
+        name = item["value"].get("polymorphic_name")
+        if name and name.text() != "spherical":
+            raise DataError(f"{file} holds a {name.text()!r} camera; only spherical cameras (panoramas) can be used")
+    views, poses = _mvg_views(data), _mvg_poses(data)
+    # The image folder on the machine of the reconstruction; only its last name is used, because a file from elsewhere
+    # must not reach other folders.
+    stated = data.get("root_path")
+    root = PurePosixPath(stated.text().replace("\\", "/")).name if stated else ""
+    images = image_folder(folder, options.images, ("images", "imgs", *([root] if root not in ("", "..") else [])))
+    posed = [view for view in views if view.pose in poses]
+    frames = tuple(Frame(view.name, images / view.name, poses[view.pose], *view.size) for view in posed)
+    if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply")):
+        note = "points: from the PLY file beside sfm_data.json, which has colours"
+        return Capture("openmvg", folder, images, frames, colored, notes=(note,))
+    stated, cloud = data.get("structure"), None
+    structure = stated.entries() if stated else []
+    if structure:
+        points = Json([item["value"]["X"].value for item in structure], f"X of the structure of {file}")
+        cloud = Cloud(points.numbers(len(structure), 3), None)
+
+    def tracks() -> Tracks:
+        frame_of_view = {view.key: i for i, view in enumerate(posed)}
+        return Tracks.from_observations(
+            (frame_of_view[key], point, seen["value"]["x"].numbers(2).tolist())
+            for point, item in enumerate(structure)
+            if (observations := item["value"].get("observations"))
+            for seen in observations.entries()
+            if (key := seen["key"].whole()) in frame_of_view
+        )
+
+    return Capture("openmvg", folder, images, frames, cloud, tracks=tracks)
+
+
+def read_released(path: Path, options: DataOptions) -> Capture:
+    """Read a folder of the released PaD-GS or ODGS code. Views and extrinsics are joined by key."""
+    views = _mvg_views(read_json(path / "data_views.json"))
+    poses = _mvg_poses(read_json(path / "data_extrinsics.json"))
+    images = image_folder(path, options.images)
+    frames = tuple(Frame(view.name, images / view.name, poses[view.key]) for view in views if view.key in poses)
+    return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply")))
+
+
+def _mvg_views(data: Json) -> list[MvgView]:
+    views = []
+    for item in data["views"].entries():
+        view, key = item["value"]["ptr_wrapper"]["data"], item["key"]
+        local, name = view.get("local_path"), view["filename"].text()
+        folder = local.text().strip("/") if local else ""
+        name = check_name(f"{folder}/{name}" if folder else name, data.where)
+        size = view["width"].whole(), view["height"].whole()
+        views.append(MvgView(key.whole(), (view.get("id_pose") or key).whole(), name, size))
+    return views
+
+
+def _mvg_poses(data: Json) -> dict[int, Tensor]:
+    """Read the extrinsics: pose key -> cam_from_world [4, 4] float64."""
+    poses = {}
+    for item in data["extrinsics"].entries():
+        key = item["key"].whole()
+        pose = Json(item["value"].value, f"extrinsic {key} of {data.where}")
+        poses[key] = cam_from_center(pose["rotation"].numbers(3, 3), pose["center"].numbers(3), pose.where)
+    if not poses:
+        raise DataError(
+            f"{data.where} holds no extrinsics; export them too (openMVG_main_ConvertSfM_DataFormat -V -I -E -S)"
+        )
+    return poses
+
+
+def read_opensfm(path: Path, options: DataOptions) -> Capture:
+    """Read the reconstruction with the most shots."""
+    file = file_in(path, "reconstruction.json")
+    parts = read_json(file).entries()
+    if not parts:
+        raise DataError(f"{file} must hold a list of reconstructions with at least one in it")
+    best = max(parts, key=lambda part: len(part["shots"].items()))
+    images = image_folder(file.parent, options.images)
+    frames = []
+    for name, value in best["shots"].items().items():
+        shot = Json(value.value, f"shot {check_name(name, str(file))} of {file}")
+        camera = best["cameras"][shot["camera"].text()]
+        model = camera["projection_type"].text()
+        if model not in ("spherical", "equirectangular"):
+            raise DataError(f"{shot.where} has a {model!r} camera; only spherical cameras (panoramas) can be used")
+        rotation = rotation_from_vector(shot["rotation"].numbers(3), shot.where)
+        pose = cam_from_world(rotation, shot["translation"].numbers(3), shot.where)
+        width, height = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
+        frames.append(Frame(name, images / name, pose, width, height))
+    used = f"{file.name} holds {len(parts)} reconstructions; the one with the most shots, {len(frames)}, is used"
+    notes = (used,) if len(parts) > 1 else ()
+    return Capture("opensfm", file.parent, images, tuple(frames), _opensfm_cloud(best), notes=notes)
+
+
+def _opensfm_cloud(part: Json) -> Cloud | None:
+    stated = part.get("points")
+    points = list(stated.items().values()) if stated else []
+    if not points:
+        return None
+    where, colors = f"the points of {part.where}", None
+    positions = Json([point["coordinates"].value for point in points], where)
+    stated = [point.get("color") for point in points]
+    if all(stated):
+        values = Json([color.value for color in stated if color], f"color of {where}").numbers(len(points), 3)
+        colors = color_bytes(whole_if_possible(values.numpy()), where)
+    return Cloud(positions.numbers(len(points), 3), colors)
