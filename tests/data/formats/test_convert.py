@@ -97,7 +97,9 @@ def test_nested_images(world: World, tmp_path: Path) -> None:
     convert(tmp_path / "a", tmp_path / "b", "colmap")
     convert(tmp_path / "b", tmp_path / "c", "released")
     scene = load(tmp_path / "c")
-    assert {"eins/pano_00", "zwei ü/pano_01"} <= {view.name.removeprefix("images/") for view in (*scene.train, *scene.test)}
+    assert {"eins/pano_00", "zwei ü/pano_01"} <= {
+        view.name.removeprefix("images/") for view in (*scene.train, *scene.test)
+    }
 
 
 def test_a_full_disk_leaves_no_files(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
