@@ -207,9 +207,10 @@ def _tuple(kinds: tuple[Any, ...], value: Sequence[Any], where: str) -> tuple[An
 
 def _name(kind: Any) -> str:
     names = {type(None): "null", bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-    if is_dataclass(kind) or get_origin(kind) is Mapping:
+    origin = get_origin(kind)
+    if is_dataclass(kind) or isinstance(origin, type) and issubclass(origin, Mapping):
         return "a group of keys"
-    if get_origin(kind) is tuple:
+    if origin is tuple:
         return "a list" if Ellipsis in get_args(kind) else f"a list of {len(get_args(kind))} values"
     return names.get(kind) or getattr(kind, "__name__", str(kind))
 

@@ -10,11 +10,12 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Any
 
+from padgs.checks import typed
 from padgs.files import read_regular, write_atomically
 
 STATUSES = {
@@ -254,19 +255,15 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     if document.pop("schema") != SCHEMA:
         raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); run again with this one")
     digest = document.pop("sha256", None)
-    known = {field.name for field in fields(Result)}
-    missing, unknown = known - document.keys(), document.keys() - known
-    if missing or unknown:
-        raise ResultError(f"{where}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
     try:
-        if digest != _digest(document):
-            raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
-        result = Result(**document | {key: _part(key, document[key]) for key in _DECODERS})
-        _refuse_other_types(result)
-    except ResultError:
-        raise
+        edited = digest != _digest(document)
+        scores = _scores(document.pop("scores"))
+        result = replace(typed(Result, document), scores=scores)
+        _refuse_impossible(result)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise ResultError(f"{where}: {str(error):.300}; delete it and run again") from error
+    if edited:
+        raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
     names = [result.run, result.method, result.preset, *result.experiments, *result.scores]
     for name in (*names, *filter(None, [result.dataset])):
         if not PLAIN.fullmatch(name):
@@ -289,27 +286,15 @@ def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
     return results, errors
 
 
-def _refuse_other_types(result: Result) -> None:
-    for name, hint in get_type_hints(Result).items():
-        hints = get_args(hint) if get_origin(hint) is UnionType else (hint,)
-        kinds = tuple(get_origin(kind) or kind for kind in hints)
-        value = getattr(result, name)
-        if not isinstance(value, kinds) or isinstance(value, bool):
-            raise TypeError(f"{name} is {value!r}; it must be {' or '.join(kind.__name__ for kind in kinds)}")
-        if isinstance(value, int) and not 0 <= value < 2**63:
-            raise ValueError(f"{name} is {value}; it must be at least 0")
+def _refuse_impossible(result: Result) -> None:
+    """Refuse values of the right type that no run writes; a digest is no signature."""
     for name, value in result.timing.items():
-        if value is not None and not 0 <= value < math.inf:
+        if value < 0:
             raise ValueError(f"timing.{name} is {value}; it must be a time, at least 0")
     names = [*vars(result).values(), *(view for scores in result.scores.values() for view in scores.views)]
     for name in names:
         if isinstance(name, str) and name != result.reason and len(name) > LONGEST_NAME:
             raise ValueError(f"{name[:20]}... has {len(name)} letters; names have at most {LONGEST_NAME}")
-    if not all(isinstance(name, str) for name in result.experiments):
-        raise TypeError(f"experiments are {result.experiments!r}; they must be names")
-    for name, count in result.counts.items():
-        if not (isinstance(count, int) and 0 <= count < 2**63):
-            raise TypeError(f"counts.{name} is {count!r}; it must be a count")
     for name in CONFIG_GROUPS & result.config.keys():
         if not isinstance(result.config[name], dict):
             raise TypeError(f"config.{name} is {result.config[name]!r}; it must be a group of settings")
@@ -343,22 +328,15 @@ def _numbers(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _scores(table: dict[str, Any]) -> dict[str, Scores]:
-    return {
-        name: Scores(
-            scores["protocol"],
-            _numbers(scores["metrics"]),
-            {view: _numbers(values) for view, values in scores["views"].items()},
-            tuple(scores["notes"]),
-        )
-        for name, scores in table.items()
-    }
-
-
-_DECODERS = {"scores": _scores, "timing": _numbers, "experiments": tuple}
-
-
-def _part(key: str, value: Any) -> Any:
     try:
-        return _DECODERS[key](value)
+        return {
+            name: Scores(
+                scores["protocol"],
+                _numbers(scores["metrics"]),
+                {view: _numbers(values) for view, values in scores["views"].items()},
+                tuple(scores["notes"]),
+            )
+            for name, scores in table.items()
+        }
     except (KeyError, TypeError, AttributeError) as error:
-        raise TypeError(f"{key} does not have the form that this program writes ({str(value):.60})") from error
+        raise TypeError(f"scores do not have the form that this program writes ({str(table):.60})") from error

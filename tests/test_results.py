@@ -57,34 +57,21 @@ def test_the_file_is_standard_json(result, tmp_path):
     assert json.loads(text, parse_constant=refuse)["scores"]["sphere"]["views"]["a"]["psnr"] == "inf"
 
 
-@pytest.mark.parametrize("bytes_left", [0, 1, 100, -2])
-def test_a_truncated_file_is_named(result, tmp_path, bytes_left):
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        *((lambda text, end=end: text[:end], "(JSON|no schema)") for end in (0, 1, 100, -2)),
+        (lambda text: text.replace("24.25", "34.25"), "was edited after it was written"),
+        (lambda text: text.replace("24.25", "NaN"), "NaN is no number of a result"),
+        (lambda text: text.replace('"schema": 2', '"schema": 1'), "was written by another version"),
+        (lambda text: text.replace('"seed"', '"colour"'), "unknown key colour; known: .*seed"),
+        (lambda text: "[" * 100_000, "is not JSON"),
+    ],
+)
+def test_a_damaged_file_is_named(result, tmp_path, spoil, message):
     path = results.write(result, tmp_path)
-    path.write_bytes(path.read_bytes()[:bytes_left])
-    with pytest.raises(ResultError, match=str(path)):
-        results.read(path)
-
-
-def test_an_edited_number_is_noticed(result, tmp_path):
-    path = results.write(result, tmp_path)
-    path.write_text(path.read_text().replace("24.25", "34.25"))
-    with pytest.raises(ResultError, match="edited"):
-        results.read(path)
-
-
-def test_another_schema_is_named(result, tmp_path):
-    path = results.write(result, tmp_path)
-    path.write_text(path.read_text().replace('"schema": 2', '"schema": 1'))
-    with pytest.raises(ResultError, match="another version"):
-        results.read(path)
-
-
-def test_missing_and_unknown_keys_are_listed(result, tmp_path):
-    path = results.write(result, tmp_path)
-    document = json.loads(path.read_text())
-    document["colour"] = document.pop("seed")
-    path.write_text(json.dumps(document))
-    with pytest.raises(ResultError, match=r"missing \['seed'\], unknown \['colour'\]"):
+    path.write_text(spoil(path.read_text()))
+    with pytest.raises(ResultError, match=rf"result.json.*{message}"):
         results.read(path)
 
 
@@ -95,18 +82,17 @@ def test_missing_and_unknown_keys_are_listed(result, tmp_path):
         ({"preset": "x y"}, "'x y' is no name"),
         ({"dataset": "/etc"}, "'/etc' is no name"),
         ({"experiments": ("tau@cpu", "../../x")}, "'../../x' is no name"),
-        ({"experiments": (1,)}, "they must be names"),
-        ({"experiments": 1}, r"experiments does not have the form that this program writes \(1\)"),
-        ({"timing": 5}, "timing does not have the form"),
-        ({"scores": {"paper": 3}}, "scores does not have the form"),
-        ({"scores": {"paper": {"metrics": {}}}}, "scores does not have the form"),
-        ({"seed": "0"}, "seed is '0'; it must be int"),
-        ({"config": []}, "config is ..; it must be dict"),
+        ({"experiments": (1,)}, r"experiments\[0\] is 1; it must be a text"),
+        ({"experiments": 1}, "experiments is 1; it must be a list"),
+        ({"timing": 5}, "timing is 5; it must be a group of keys"),
+        ({"scores": {"paper": 3}}, "scores do not have the form"),
+        ({"scores": {"paper": {"metrics": {}}}}, "scores do not have the form"),
+        ({"seed": "0"}, "seed is '0'; it must be a whole number"),
+        ({"config": []}, "config is ..; it must be a group of keys"),
         ({"iterations": True}, "iterations is True"),
-        ({"timing": 3}, "timing|items"),
         ({"timing": {"train_seconds": 10**400}}, "no number of a result"),
-        ({"timing": {"train_seconds": -1.0}}, "timing.train_seconds is -1.0; it must be a time, at least 0"),
-        ({"iterations_done": -5}, "iterations_done is -5; it must be at least 0"),
+        ({"timing": {"train_seconds": -1.0}}, "timing.train_seconds is -1.0; it must be from 0"),
+        ({"iterations_done": -5}, "iterations_done is -5; it must be from 0"),
         ({"reason": "\ud800"}, "surrogates not allowed"),
         ({"counts": {"gaussians": "many"}}, "counts.gaussians is 'many'"),
         ({"config": {"train": []}}, r"config.train is \[\]; it must be a group"),
@@ -123,19 +109,6 @@ def test_files_from_elsewhere_hold_names_and_numbers_where_they_should(result, t
     """A digest is no signature: whoever sends a file can make it fit."""
     with pytest.raises(ResultError, match=rf"result.json: .*({message})"):
         results.read(results.write(replace(result, **change), tmp_path))
-
-
-def test_a_bare_nan_leaves_its_file_out(result, tmp_path):
-    path = results.write(result, tmp_path)
-    path.write_text(path.read_text().replace("24.25", "NaN"))
-    with pytest.raises(ResultError, match=r"result.json: NaN is no number of a result"):
-        results.read(path)
-
-
-def test_a_file_that_is_nested_too_deep_is_named(tmp_path):
-    (tmp_path / "result.json").write_text("[" * 100_000)
-    with pytest.raises(ResultError, match="result.json is not JSON"):
-        results.read(tmp_path / "result.json")
 
 
 def test_unknown_status_lists_the_known(result):

@@ -218,7 +218,7 @@ def _final(config: RunConfig, result: Result, progress: Progress) -> Result:
         result = replace(result, variant=", ".join(filter(None, (config.row, f"stopped after {done} iterations"))))
     return replace(
         result,
-        iterations=done if config.budget.seconds is not None else result.iterations,
+        iterations=(config.budget.seconds is not None and done) or result.iterations,
         iterations_done=done,
         finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
     )
