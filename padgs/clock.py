@@ -142,14 +142,9 @@ def commit(folder: Path | None = None) -> str | None:
     folder = Path(__file__).resolve().parent.parent if folder is None else folder
     if not (folder / ".git").exists():
         return None  # without this check, an installed package would report whatever repository lies around it
-    head = _git(folder, "rev-parse", "HEAD")
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return head and head + ("+" if changed else "")
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=40", "--exclude=*"]
     try:
-        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None

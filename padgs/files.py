@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import math
 import os
-import re
 import shutil
 import socket
 import struct
@@ -72,30 +71,18 @@ def check_place(path: Path) -> None:
 def draft_of(path: Path) -> Iterator[Path]:
     """Yield a hidden path beside `path` for a file or folder; what is there at the end is removed.
 
-    Drafts that a killed process left in this folder are removed first: those of processes of this host that have ended,
-    and those of other hosts that have not changed for a day.
+    Drafts that killed processes left in this folder, and that have not changed for a day, are removed first.
     """
-    owner = f"{DRAFT}{socket.gethostname()}-"
     with suppress(OSError):
         for left in path.parent.glob(f"{DRAFT}*"):
-            process = re.match(r"(\d{1,9})-", left.name.removeprefix(owner))
-            if _has_ended(int(process[1])) if process else time.time() - left.lstat().st_mtime > DAY:
+            if time.time() - left.lstat().st_mtime > DAY:
                 _remove(left)
-    draft = path.with_name(f"{owner}{os.getpid()}-{path.name[-40:]}")  # the suffix tells programs the format
+    name = f"{DRAFT}{socket.gethostname()}-{os.getpid()}-{path.name[-40:]}"  # the suffix tells programs the format
+    draft = path.with_name(name)
     try:
         yield draft
     finally:
         _remove(draft)
-
-
-def _has_ended(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    except OSError:  # of another user
-        pass
-    return False
 
 
 def _remove(path: Path) -> None:

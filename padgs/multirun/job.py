@@ -1,12 +1,20 @@
-"""One run as a job: the only one of a process, or one of a multirun, in the process that launched it or another one."""
+"""One run as a job: the only one of a process, or one of a multirun, in the process that launched it or another one.
+
+`<run.folder>/.multirun/START/` holds one small file per job of a multirun, which only that job writes, and `stop`,
+which asks all jobs to stop. Nothing else couples a job to its parent, so it runs on any machine that sees the folder.
+"""
 
 from __future__ import annotations
 
+import json
 import sys
+import time
 import traceback
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TextIO
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
@@ -17,7 +25,6 @@ from rich.console import Console
 
 from padgs.apps.viewer.process import serve_training
 from padgs.checks import unknown
-from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.results import SMALLEST_STATED, Result
 from padgs.runs.config import RunConfig
@@ -29,13 +36,105 @@ from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy, RunStore
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
+WAITING, RUNNING, OK = "waiting", "running", "ok"
+# A job ends with a status of `padgs.results.STATUSES`, or without a result:
+REFUSED = "refused"  # the configuration or the data cannot be used; there is no run
+CRASHED = "crashed"  # by an error in the program; the traceback is in the job's output
+KILLED = "killed"  # its process died
+ELSEWHERE = "elsewhere"  # another process works on this run
+STOPPED = "stopped"  # on request, after it wrote its checkpoint
+UNFINISHED = (RUNNING, WAITING, ELSEWHERE, STOPPED)  # neither done nor failed
+SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`
+
+
+@dataclass(frozen=True)
+class JobState:
+    """State of one job."""
+
+    status: str = WAITING
+    run: str = ""  # name of its run folder, once it is known
+    reason: str = ""  # why it failed
+    data: str | None = None  # folder of the data set, absolute; None for a generated scene
+
+    @property
+    def ended(self) -> bool:
+        """True if the job does nothing more."""
+        return self.status not in (WAITING, RUNNING)
+
+
+class Board:
+    """The folder of one multirun."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._looked, self._stop = -float("inf"), False
+
+    def write(self, job: int, state: JobState) -> None:
+        """Write the state of a job; a full disk must not end the job, so nothing is raised."""
+        with suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            draft = self._path(job).with_suffix(".draft")  # never read half-written
+            draft.write_text(json.dumps(asdict(state)))
+            draft.replace(self._path(job))
+
+    def read(self, job: int) -> JobState:
+        """Return the state of a job; waiting, if it has written none."""
+        try:
+            return JobState(**json.loads(self._path(job).read_bytes()))
+        except (OSError, ValueError, TypeError):
+            return JobState()
+
+    def output(self, job: int) -> TextIO:
+        """Open the file for the screen output of a job in a process of its own; the caller closes it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return (self.folder / f"{job:05d}.log").open("a", buffering=1)
+
+    def request_stop(self) -> None:
+        """Ask running jobs to write their checkpoints and stop, and waiting jobs not to start."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "stop").touch()
+        self._stop = True
+
+    def stop_requested(self) -> bool:
+        """Return whether a stop was requested; looks at the file system at most once a second."""
+        now = time.monotonic()
+        if not self._stop and now - self._looked >= SECONDS_BETWEEN_LOOKS:
+            self._looked, self._stop = now, (self.folder / "stop").exists()
+        return self._stop
+
+    def _path(self, job: int) -> Path:
+        return self.folder / f"{job:05d}.json"
+
+
+class BoardEntry(Callback):
+    """Callback of a run that writes the state of its job."""
+
+    def __init__(self, board: Board, number: int) -> None:
+        self.data: str | None = None  # folder of the data set
+        self._board, self._number, self._state = board, number, JobState(RUNNING)
+        self._board.write(number, self._state)
+
+    def started(self, folder: Path) -> None:
+        """Write the name of the run folder."""
+        self._state = replace(self._state, run=folder.name, data=self.data)
+        self._board.write(self._number, self._state)
+
+    def stop_requested(self) -> bool:
+        """Return whether the multirun is to stop."""
+        return self._board.stop_requested()
+
+    def end(self, status: str, reason: str = "") -> str:
+        """Write and return the status that the job ended with."""
+        self._state = replace(self._state, status=status, reason=reason)
+        self._board.write(self._number, self._state)
+        return status
 
 
 def job_of_many(composed: DictConfig) -> str:
     """Do one run of a multirun; raises nothing but an interruption, so that the other jobs go on.
 
     Returns:
-        Its status, one of `padgs.results.STATUSES` or of `padgs.multirun.board`.
+        Its status, one of `padgs.results.STATUSES` or below.
     """
     answer_signals()  # of a process of its own
     hydra = HydraConfig.get()

@@ -23,9 +23,8 @@ def main() -> None:
 
             from rich.console import Console
 
-            from padgs.multirun.board import OK
             from padgs.multirun.composition import composing, configuration, multirun
-            from padgs.multirun.job import search_smallest, served_scene
+            from padgs.multirun.job import OK, search_smallest, served_scene
             from padgs.multirun.sweep import sweep
             from padgs.runs.console import say
             from padgs.runs.run import Callback, run

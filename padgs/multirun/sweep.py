@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import repeat
@@ -32,9 +32,22 @@ from rich.table import Table
 
 from padgs import results
 from padgs.checks import printable, typed
-from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, WAITING, Board, JobState, status_line
 from padgs.multirun.finished import FinishedJobs
-from padgs.multirun.job import complain, in_own_process, job_of_many
+from padgs.multirun.job import (
+    CRASHED,
+    ELSEWHERE,
+    KILLED,
+    OK,
+    REFUSED,
+    RUNNING,
+    UNFINISHED,
+    WAITING,
+    Board,
+    JobState,
+    complain,
+    in_own_process,
+    job_of_many,
+)
 from padgs.multirun.overrides import expand
 from padgs.results import Result, ResultError
 from padgs.runs.config import RunOptions
@@ -232,6 +245,28 @@ class Multirun:
 
     def _say(self, text: str) -> None:
         say(self._console, text)
+
+
+def status_line(before: Counter[str], states: Collection[JobState], seconds: float) -> str:
+    """Sum up a multirun in one line, from the statuses of runs finished before and the states of jobs.
+
+    >>> states = [JobState("ok"), JobState("nan"), JobState("running"), JobState()]
+    >>> status_line(Counter(ok=2), states, 60.0)
+    '3 of 6 done (2 before), 1 failed (nan), 1 running, 1 waiting, ETA 1:00'
+    """
+    counts = before + Counter(state.status for state in states)
+    total, done, earlier = counts.total(), counts.pop(OK, 0), before[OK]
+    parts = [f"{done} of {total} done" + (f" ({earlier} before)" if earlier else "")]
+    unfinished = {name: counts.pop(name, 0) for name in UNFINISHED}
+    if counts.total():
+        statuses = [name if number == 1 else f"{number} {name}" for name, number in counts.most_common()]
+        parts.append(f"{counts.total()} failed ({', '.join(statuses)})")
+    parts += [f"{number} {name}" for name, number in unfinished.items() if number]
+    left = unfinished[RUNNING] + unfinished[WAITING]
+    ran = sum(state.status in results.STATUSES for state in states)
+    if left and ran:  # all runs count alike
+        parts.append(f"ETA {duration(seconds * left / ran)}")
+    return ", ".join(parts)
 
 
 def titles(jobs: Sequence[Sequence[str]]) -> list[str]:

@@ -21,8 +21,7 @@ from padgs.evaluation.scoring import score
 from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
-from padgs.runs.config import RunConfig, config_from_values
-from padgs.runs.device import choose_device
+from padgs.runs.config import RunConfig, choose_device, config_from_values
 from padgs.runs.run import build_method, load_scene
 from padgs.runs.store import PROGRESS, Progress, RunFolderError, RunStore, config_hash
 from padgs.scene import Scene, View

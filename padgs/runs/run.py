@@ -9,7 +9,6 @@ import json
 import time
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,8 @@ from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
 from padgs.results import STATUSES, STOP_REQUESTED, Result
 from padgs.runs.checkpoint import CheckpointError
-from padgs.runs.config import RunConfig
+from padgs.runs.config import RunConfig, choose_device
 from padgs.runs.console import LiveLine, introduce, say, show_result
-from padgs.runs.device import choose_device
 from padgs.runs.interrupt import STOP_SIGNALS, Interrupt, Interrupted
 from padgs.runs.store import Progress, RunBusy, RunFolderError, RunStore, config_hash
 from padgs.scene import Scene
@@ -194,8 +192,11 @@ def _prepared(config: RunConfig, scene: Scene, store: RunStore, console: Console
     method = build_method(config)
     if config.init is not None and not store.has_checkpoint:
         stress, device = config.values().get("stress"), scene.points.device
-        at_width = partial(_fingerprint_at, config, device)
-        method.warm_start(config.init.state(scene.fingerprint, at_width, device, stress))
+
+        def fingerprint_at(width: int | None) -> str:
+            return load_scene(replace(config, data=replace(config.data, width=width)), device).fingerprint
+
+        method.warm_start(config.init.state(scene.fingerprint, fingerprint_at, device, stress))
     store.prepare(config.values())
     progress = store.resume(method, scene.points.device)
     if progress.iteration:
@@ -263,13 +264,7 @@ def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, metho
     return probed.get("psnr")
 
 
-def _fingerprint_at(config: RunConfig, device: torch.device, width: int | None) -> str:
-    """Return the fingerprint of the run's scene at another image width."""
-    return load_scene(replace(config, data=replace(config.data, width=width)), device).fingerprint
-
-
 def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]:
-    """Return the fields of a result that describe a trained method."""
     size = method.size()
     initial = {"start": method.start} if "gaussians" in size.counts else {}
     return {
@@ -308,16 +303,13 @@ def judge(result: Result, scene: Scene, iterations: int) -> Result:
 
 
 def _is_incomplete(config: RunConfig, result: Result) -> bool:
-    return _is_retried(config, result) or bool(_unscored(config, result)) or _completed_labels(config, result) != result
+    """Return whether a finished run is to be trained again, lacks scores, or does not name the experiments of here."""
+    labels = results.joined(result.experiments, config.labels.experiments)
+    return _is_retried(config, result) or bool(_unscored(config, result)) or labels != result.experiments
 
 
 def _is_retried(config: RunConfig, result: Result) -> bool:
     return result.status in RETRIED and config.retry == "failed"
-
-
-def _completed_labels(config: RunConfig, result: Result) -> Result:
-    """Return a finished result with the experiments that request it here."""
-    return replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
 
 
 def _unscored(config: RunConfig, result: Result) -> dict[str, Protocol]:
@@ -337,7 +329,7 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
         if result is not None:
             store.forget(result)
         return None
-    complete = _completed_labels(config, result)
+    complete = replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
     if unscored := _unscored(config, result):
         say(console, "finished before; only the new protocol is missing")
         if not store.has_checkpoint:  # an untrained method would be scored

@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from padgs.multirun import sweep
-from padgs.multirun.board import Board, JobState, status_line
-from padgs.multirun.sweep import Display, repeated
+from padgs.multirun.job import Board, JobState
+from padgs.multirun.sweep import Display, repeated, status_line
 
 
 def line(*statuses: str, before: dict[str, int] | None = None) -> str:

@@ -13,7 +13,7 @@ from support import made_up
 
 from padgs import results
 from padgs.multirun import sweep
-from padgs.multirun.board import Board, JobState
+from padgs.multirun.job import Board, JobState
 from padgs.multirun.sweep import Multirun
 from padgs.runs.interrupt import Interrupted
 

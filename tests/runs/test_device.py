@@ -6,8 +6,7 @@ from support.tiny_scene import tiny_scene
 from padgs.native import cuda
 from padgs.render import RenderConfig
 from padgs.runs import run as pipeline
-from padgs.runs.config import RunOptions
-from padgs.runs.device import choose_device
+from padgs.runs.config import RunOptions, choose_device
 from padgs.runs.run import load_scene
 
 GPU = torch.device("cuda", 0)
