@@ -8,7 +8,7 @@ from dataclasses import asdict
 import torch
 from torch import Tensor
 
-from padgs.evaluation.lpips import LpipsUnavailable, lpips, weighted_lpips
+from padgs.evaluation.lpips import LpipsUnavailable, lpips
 from padgs.evaluation.metrics import METRICS, sphere_weight
 from padgs.evaluation.protocols import Protocol
 from padgs.render import Rendering
@@ -75,7 +75,9 @@ def score(
     metrics: Metrics = {name: finite_or_none(METRICS[name](image, truth, mask)) for name in protocol.metrics}
     if protocol.lpips_name is not None:
         try:
-            metrics[protocol.lpips_name] = finite_or_none(_lpips(image, truth, mask, protocol))
+            weight = sphere_weight(image, mask) if protocol.solid_angle else None
+            value = lpips(image, truth, mask, weight=weight, net=protocol.lpips, inputs=protocol.lpips_inputs)
+            metrics[protocol.lpips_name] = finite_or_none(value)
         except LpipsUnavailable as reason:
             metrics[protocol.lpips_name] = None
             if notes is not None:
@@ -128,13 +130,6 @@ def checked(image: Tensor, view: View) -> Tensor:
     if bad:
         raise Failure("nan", f"render of view {view.name!r} has {bad} non-finite values")
     return image
-
-
-def _lpips(image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol) -> Tensor:
-    net, inputs = protocol.lpips, protocol.lpips_inputs
-    if not protocol.solid_angle:
-        return lpips(image, truth, mask, net=net, inputs=inputs)
-    return weighted_lpips(image, truth, sphere_weight(image, mask), mask=mask, net=net, inputs=inputs)
 
 
 def finite_or_none(metric: Tensor) -> float | None:

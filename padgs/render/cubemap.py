@@ -8,7 +8,7 @@ onto the plane of each face, so its footprint changes from face to face: the sea
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil, pi
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.geometry.panorama import rays
-from padgs.render.contract import Backend, Rendering, Request
+from padgs.render.contract import Backend, LazyCounters, Rendering, Request
 from padgs.render.projection import camera_frame
 from padgs.render.projective import mean_shift
 
@@ -88,26 +88,17 @@ def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhol
     covered = coverage > 0
     depth = torch.where(covered, depth, 0) / torch.where(covered, coverage, 1)
     visible = torch.stack([face.visible for face in faces]).any(0)
-    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, SummedCounters(faces, visible))
+    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, summed_counters(faces, visible))
 
 
-class SummedCounters(Mapping[str, int]):
-    """Counters of several renderings of the same Gaussians; summed, which waits for a GPU, on access."""
+def summed_counters(parts: Sequence[Rendering], visible: Tensor) -> LazyCounters:
+    """Return the summed counters of several renderings of N Gaussians, of which `visible` [N] are seen in any."""
+    names = [name for name in parts[0].counters if name not in ("gaussians", "visible")]
 
-    def __init__(self, parts: Sequence[Rendering], visible: Tensor) -> None:
-        """Keep the counters of the parts, and `visible` [N], the Gaussians visible in any part."""
-        self._of_parts, self._visible = [part.counters for part in parts], visible
+    def read() -> list[int]:
+        return [int(visible.sum()), *(sum(part.counters[name] for part in parts) for name in names)]
 
-    def __getitem__(self, name: str) -> int:
-        if name == "gaussians":
-            return len(self._visible)
-        return int(self._visible.sum()) if name == "visible" else sum(counters[name] for counters in self._of_parts)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._of_parts[0])
-
-    def __len__(self) -> int:
-        return len(self._of_parts[0])
+    return LazyCounters({"gaussians": len(visible)}, ("visible", *names), read)
 
 
 @lru_cache(maxsize=16)

@@ -16,7 +16,7 @@ from padgs.geometry.distortion import solid_angle_weight
 from padgs.geometry.lens import axis_direction, bend, check_blend, hemisphere_weight
 from padgs.geometry.panorama import project, rays, sample_pixels
 from padgs.render import Rendering
-from padgs.render.cubemap import SummedCounters
+from padgs.render.cubemap import summed_counters
 from padgs.scene import View
 from padgs.training.loss import pixel_weight
 from padgs.training.model import TrainingRender
@@ -237,7 +237,7 @@ def stitched(front: Rendering, back: Rendering, weight: Tensor) -> Rendering:
         transmittance=torch.lerp(back.transmittance, front.transmittance, weight),
         depth=torch.lerp(back.depth, front.depth, weight),
         visible=visible,
-        counters=SummedCounters((front, back), visible),
+        counters=summed_counters((front, back), visible),
     )
 
 

@@ -32,7 +32,7 @@ def picture(
 ):
     """Return the image, and the gradients of its sum times `weight` [H, W, 3] by every input."""
     inputs, view = leaves(gaussians, dtype), view_of(camera, pose)
-    rendering = render(inputs, view, RenderOptions(projection, **options), backend=backend, check_values=True)
+    rendering = render(inputs, view, RenderOptions(projection, **options), backend=backend)
     if weight is None:
         return rendering.image
     return rendering.image, torch.autograd.grad((rendering.image * weight).sum(), list(vars(inputs).values()))

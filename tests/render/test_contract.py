@@ -76,37 +76,21 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
 
 
 @pytest.mark.parametrize(
-    ("name", "index", "value", "message"),
+    ("name", "index", "value"),
     [
-        ("scales", (3, 1), 0.0, r"scales\[3, 1\] is 0.0; scales must be > 0"),
-        ("scales", (0, 2), -0.5, r"scales\[0, 2\] is -0.5; scales must be > 0"),
-        ("opacities", (4,), 1.5, r"opacities\[4\] is 1.5; opacities must be in \[0, 1\]"),
-        ("opacities", (0,), -0.25, r"opacities\[0\] is -0.25; opacities must be in \[0, 1\]"),
-        ("quats", (2,), 0.0, r"quats\[2\] is \[0.0, 0.0, 0.0, 0.0\]; quats must not be zero"),
-        ("means", (1, 2), float("nan"), r"means has 1 non-finite values, first at \[1, 2\]"),
-        ("colors", (1, 0), float("inf"), r"colors has 1 non-finite values, first at \[1, 0\]"),
+        ("scales", (3, 1), 0.0),
+        ("scales", (0, 2), -0.5),
+        ("opacities", (4,), 1.5),
+        ("quats", (2,), 0.0),
+        ("means", (1, 2), float("nan")),
+        ("colors", (1, 0), float("inf")),
     ],
 )
 @each_engine
-def test_bad_values_are_named_when_checked(name, index, value, message, backend, dtype, gaussians: Gaussians):
+def test_bad_values_do_not_crash(name, index, value, backend, dtype, gaussians: Gaussians):
     broken = leaves(gaussians, dtype)
     getattr(broken, name).data[index] = value
-    with pytest.raises(ValueError, match=message):
-        render(broken, VIEW, backend=backend, check_values=True)
-    render(broken, VIEW, backend=backend)  # unchecked: no crash
-
-
-def test_bad_poses_backgrounds_and_offsets_are_named_when_checked(gaussians: Gaussians):
-    stretched, lost = 2 * identity_pose(), identity_pose()
-    lost[1, 3] = float("nan")
-    with pytest.raises(ValueError, match="the 3x3 part of cam_from_world is not a rotation"):
-        render(gaussians, VIEW.at(stretched), check_values=True)
-    with pytest.raises(ValueError, match=r"cam_from_world has 1 non-finite values, first at \[1, 3\]"):
-        render(gaussians, VIEW.at(lost), check_values=True)
-    with pytest.raises(ValueError, match="background has 3 non-finite values"):
-        render(gaussians, VIEW, background=torch.full((3,), float("nan")), check_values=True)
-    with pytest.raises(ValueError, match="mean_offsets has 10 non-finite values"):
-        render(gaussians, VIEW, mean_offsets=torch.full((5, 2), float("inf")), check_values=True)
+    render(broken, VIEW, backend=backend)
 
 
 @pytest.mark.parametrize(
@@ -184,19 +168,16 @@ def test_unsupported_cameras_are_refused(projection, lens, more, message, backen
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @each_engine
-def test_rays_must_have_unit_length(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+def test_a_bad_ray_spoils_its_own_pixel_only(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
     options, camera = RenderOptions(projection), camera_of("fisheye", 32, 16)
-    for value, off in ((0.0, "1"), (2.0, "3"), (float("nan"), "nan"), (float("inf"), "inf")):
+    expected = render(gaussians.to(dtype), view_of(camera), options, backend=backend).image
+    others = torch.ones(16, 32, dtype=torch.bool)
+    others[3, 4] = False
+    for value in (0.0, 2.0, float("nan"), float("inf")):
         table = camera.table.clone()
         table[3, 4] = table[3, 4] * value
-        view = view_of(RayTable(table, camera.focal))
-        with pytest.raises(ValueError, match=f"direction whose squared length differs from 1 by {off}; normalise it"):
-            render(gaussians.to(dtype), view, options, backend=backend, check_values=True)
-        image = render(gaussians.to(dtype), view, options, backend=backend).image
-        expected = render(gaussians.to(dtype), view_of(camera), options, backend=backend).image
-        others = torch.ones(16, 32, dtype=torch.bool)
-        others[3, 4] = False
-        torch.testing.assert_close(image[others], expected[others])  # a bad ray spoils its own pixel only
+        image = render(gaussians.to(dtype), view_of(RayTable(table, camera.focal)), options, backend=backend).image
+        torch.testing.assert_close(image[others], expected[others])
 
 
 @pytest.mark.parametrize("shape", [(16, 32), (16, 32, 2), (16, 32, 4), (3, 16, 32, 3), ()])
@@ -266,7 +247,7 @@ def test_without_gaussians_the_image_is_the_background(projection, lens, blendin
     background = torch.tensor([0.25, 0.5, 0.75], dtype=dtype, requires_grad=True)
     extra = {"background": background, "mean_offsets": torch.zeros(0, 2, dtype=dtype), "backend": backend}
     view = view_of(camera_of(lens, 32, 16))
-    rendering = render(nothing, view, RenderOptions(projection, blending=blending), check_values=True, **extra)
+    rendering = render(nothing, view, RenderOptions(projection, blending=blending), **extra)
     assert torch.equal(rendering.image, background.expand(16, 32, 3))
     assert torch.equal(rendering.transmittance, torch.ones(16, 32, dtype=dtype))
     assert torch.equal(rendering.depth, torch.zeros(16, 32, dtype=dtype))

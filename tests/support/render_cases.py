@@ -169,7 +169,7 @@ def draw(
     """Render with one engine; the pose may require a gradient."""
     more = {name: value.to(dtype) if isinstance(value, Tensor) else value for name, value in more.items()}
     view = view_of(camera_of(lens, width, height), pose)
-    return render(gaussians.to(dtype), view, options=options, backend=backend, check_values=True, **more)
+    return render(gaussians.to(dtype), view, options=options, backend=backend, **more)
 
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:

@@ -11,14 +11,13 @@ options     of the command
 ceilings    arithmetic (FLOP/s), memory (byte/s), crowding: see `padgs.apps.bench.ceilings.Ceilings`
 sizes       name -> one workload:
   width, height, gaussians (requested), views
-  counters    of the renderer, with ratios, anchors, parameters, and the median size of Gaussians in pixels
+  counters    of the renderer, with ratios, anchors and parameters
   stages      stage -> seconds in one iteration (least CPU seconds of all threads; of a GPU kernel the mean), on the CPU
               wall, and floor and bound for stages with a cost model; on a GPU calls
   floor       sum of the least seconds of the stages at the ceilings
   iteration   of `padgs.training.loop.Trainer`, {wall, cpu: {median, p95, min}}; iteration_1_thread on the CPU
   frame       decode and render without gradients
   peak_bytes  memory at the peak of frames and of training: of the process, or of torch's allocator on a GPU
-tiles       tiles per Gaussian by latitude, on the CPU: see `padgs.apps.bench.tile_counts`
 """
 
 from __future__ import annotations
@@ -38,8 +37,7 @@ from rich.table import Table
 from padgs import clock
 from padgs.apps.bench.ceilings import add_floors, measure_ceilings
 from padgs.apps.bench.stages import STAGES, WARM_UP, cpu_stages, device_stages
-from padgs.apps.bench.tile_counts import tiles_by_latitude
-from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, median_sigma
+from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build
 from padgs.checks import check, check_known, printable
 from padgs.files import check_place, write_atomically
 from padgs.native import cpu, cuda
@@ -105,9 +103,6 @@ def measure_all(
             progress(f"size {name}")
             report["sizes"][name] = measure_size(SIZES[name], options, device)
             _write(report, file)
-        if device.type == "cpu":
-            progress("tiles by latitude")
-            report["tiles"] = tiles_by_latitude(count=50_000 if options.repeats > QUICK.repeats else 20_000)
         ceilings = ceilings.best(measure_ceilings(device, options.ceiling_seconds))
     for size in report["sizes"].values():
         add_floors(size, ceilings)
@@ -173,7 +168,6 @@ def _count(work: Workload) -> dict[str, Any]:
         "evaluated_per_pixel": counted["evaluated"] / pixels,
         "contributing_per_pixel": counted["contributing"] / pixels,
         "tiles_per_gaussian": counted["instances"] / max(1, counted["visible"]),
-        "median_sigma": median_sigma(work),
     }
 
 
@@ -196,15 +190,16 @@ def lines(report: dict[str, Any]) -> Iterator[Table | str]:
     for name, size in report["sizes"].items():
         yield _stages(name, size, bool(machine["gpu"]))
         yield _counters(size)
-    if "tiles" in report:  # on the CPU
+    if not machine["gpu"]:
         yield "".join(f"  [dim]{stage.replace('_', ' ')}: {words}[/dim]\n" for stage, words in STAGES.items())
-        yield _tiles(report["tiles"])
 
 
 def _stages(name: str, size: dict[str, Any], on_gpu: bool) -> Table:
     title = f"{name}: one training iteration, {size['width']}x{size['height']}, ms"
     clocks = ("GPU", "calls") if on_gpu else ("CPU", "wall")
-    table = _table(title, "stage", *clocks, "floor", "of ceiling", "bound by")
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    for column in ("stage", *clocks, "floor", "of ceiling", "bound by"):
+        table.add_column(column, justify="left" if column in ("stage", "bound by") else "right")
     for stage, timing in list(size["stages"].items())[:MAX_STAGES]:
         second = f"{timing['calls']:.0f}" if on_gpu else _ms(timing["wall"])
         cells = [_ms(timing["floor"]), _share(timing), timing["bound"]] if "floor" in timing else []
@@ -222,28 +217,11 @@ def _stages(name: str, size: dict[str, Any], on_gpu: bool) -> Table:
 def _counters(size: dict[str, Any]) -> str:
     c, peak = size["counters"], size["peak_bytes"]
     return (
-        f"  {c['anchors']:,} anchors, {c['gaussians']:,} Gaussians ({c['visible']:,} visible, median size "
-        f"{c['median_sigma']:.2f} px), {c['instances']:,} instances = {c['tiles_per_gaussian']:.2f} tiles each\n"
+        f"  {c['anchors']:,} anchors, {c['gaussians']:,} Gaussians ({c['visible']:,} visible), {c['instances']:,} "
+        f"instances = {c['tiles_per_gaussian']:.2f} tiles each\n"
         f"  pairs per pixel: {c['evaluated_per_pixel']:.1f} evaluated, {c['contributing_per_pixel']:.1f} contributing\n"
         f"  peak memory: {peak['frame'] / 1e6:.0f} MB for frames, {peak['training'] / 1e6:.0f} MB for training\n"
     )
-
-
-def _tiles(tiles: dict[str, Any]) -> Table:
-    bands = list(tiles["exact"]["bands"])
-    title = f"tiles per Gaussian by latitude, {tiles['width']}x{tiles['height']}, sigma {tiles['sigma']:g} px"
-    table = _table(title, "bounds", "all", *(f"{band}\N{DEGREE SIGN}" for band in bands), "max")
-    for name, words in (("exact", "exact"), ("square", "square, as published")):
-        means = [tiles[name]["mean"], *(tiles[name]["bands"][band]["mean"] for band in bands)]
-        table.add_row(words, *("-" if mean is None else f"{mean:.1f}" for mean in means), str(tiles[name]["max"]))
-    return table
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 or column == "bound by" else "right")
-    return table
 
 
 def _share(timing: dict[str, Any]) -> str:

@@ -123,18 +123,9 @@ def resident(scene: Scene, device: torch.device) -> Scene:
     return replace(moved, train=tuple(map(held, moved.train)))
 
 
-def median_sigma(workload: Workload) -> float:
-    """Return the median of the decoded sizes (geometric mean of the axes), in pixels at the equator."""
-    with torch.no_grad():
-        gaussians = workload.model.decode(workload.view).gaussians
-        angles = gaussians.scales.log().mean(-1).exp() / gaussians.means.norm(dim=-1)
-    return float(angles.median()) * workload.size.width / (2 * math.pi)
-
-
 def _view(name: str, size: Size, generator: torch.Generator) -> View:
     pixels = torch.randint(0, 256, (size.height, size.width, 3), generator=generator, dtype=torch.uint8)
-    pose = torch.eye(4, dtype=torch.float64)
-    return View(name, pose, size.width, size.height, load_pixels=lambda: pixels)
+    return View(name, torch.eye(4, dtype=torch.float64), size.width, size.height, load_pixels=lambda: pixels)
 
 
 def _spread_outputs(model: PaDGS, view: View) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +25,7 @@ from padgs.render.backends.native import (
     native_rays,
     strip_cuts,
 )
-from padgs.render.contract import Removals, RenderOptions
+from padgs.render.contract import LazyCounters, Removals, RenderOptions
 
 IDENTITY = torch.eye(4)
 MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
@@ -34,20 +33,6 @@ HEADROOM = 1.3  # capacity for an image, as a multiple of the instances of the l
 _capacities: dict[tuple, int] = {}  # device, width and height -> capacity for the next image
 FLOATS = functools.partial(torch.empty, dtype=torch.float32)
 INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
-
-
-def check(means: Tensor) -> None:
-    """Refuse tensors that the library cannot render.
-
-    Raises:
-        ValueError: tensors that are not float32 on a GPU.
-    """
-    if means.dtype != torch.float32 or means.device.type != cuda.device_type():
-        missing = "" if torch.cuda.is_available() else " (torch finds no GPU with a driver here)"
-        raise ValueError(
-            f"backend cuda takes float32 tensors on a GPU, got {means.dtype} on {means.device}{missing}; convert them, "
-            "or use backend=auto"
-        )
 
 
 class DeviceStrip:
@@ -164,27 +149,6 @@ class DeviceProjected(Strips[DeviceStrip]):
         return TileTable(self.camera.width, self.camera.height, first_row, end_row)
 
 
-class Counters(Mapping[str, int]):
-    """Counters of a rendering; pairs are summed on the device and read, which waits for it, on first access."""
-
-    def __init__(self, pairs: Tensor, **known: int) -> None:
-        self._known = known
-        self._pairs: Tensor | None = pairs  # [2] evaluated and contributing
-
-    def __getitem__(self, name: str) -> int:
-        if self._pairs is not None:
-            evaluated, contributing = self._pairs.tolist()
-            self._known |= {"evaluated": evaluated, "contributing": contributing}
-            self._pairs = None
-        return self._known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(("gaussians", "visible", "instances", "evaluated", "contributing"))
-
-    def __len__(self) -> int:
-        return 5
-
-
 @dataclass(frozen=True)
 class _Kept:
     """The outputs of blending, besides the pixels, that the backward pass needs."""
@@ -205,7 +169,14 @@ class _Kept:
 
 
 class _Image(NativeImage):
-    check = staticmethod(check)
+    @staticmethod
+    def check(means: Tensor) -> None:
+        if means.dtype != torch.float32 or means.device.type != cuda.device_type():
+            missing = "" if torch.cuda.is_available() else " (torch finds no GPU with a driver here)"
+            raise ValueError(
+                f"backend cuda takes float32 tensors on a GPU, got {means.dtype} on {means.device}{missing}; convert "
+                "them, or use backend=auto"
+            )
 
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
@@ -229,7 +200,8 @@ class _Image(NativeImage):
         instances = self._projected.instances
         wanted = max(int(HEADROOM * instances) + 1, capacity * 15 // 16)
         _capacities[key] = min(wanted, limit) if instances <= limit else 0  # 0: strips need the exact number
-        self.counters = Counters(pairs, gaussians=inputs.count, visible=self._projected.visible, instances=instances)
+        known = {"gaussians": inputs.count, "visible": self._projected.visible, "instances": instances}
+        self.counters = LazyCounters(known, ("evaluated", "contributing"), pairs.tolist)
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
         return pixels, visible
 

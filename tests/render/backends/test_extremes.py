@@ -78,13 +78,11 @@ def test_extreme_gaussians_stay_finite(name: str, projection, lens, backend, dty
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
 @each_setup
 @each_engine
-def test_non_finite_gaussians_are_refused_or_not_rendered(name: str, bad: float, projection, lens, backend, dtype):
+def test_non_finite_gaussians_are_not_rendered(name: str, bad: float, projection, lens, backend, dtype):
     gaussians = gaussians_of("ordinary", 4, torch.Generator().manual_seed(2))
     broken, options = leaves(gaussians, dtype), RenderOptions(projection)
     getattr(broken, name).data[1] = bad
     engine = {"backend": backend, "dtype": dtype, "lens": lens, "options": options}
-    with pytest.raises(ValueError, match=f"{name} has .* non-finite"):
-        draw(broken, 32, 16, **engine)
     pose = identity_pose().to(dtype).requires_grad_()
     rendering = render(broken, view_of(camera_of(lens, 32, 16), pose), options, backend=backend)
     if (name, bad) != ("opacities", math.inf):  # an opacity above the maximum is limited to it

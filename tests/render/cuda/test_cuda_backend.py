@@ -259,11 +259,11 @@ def test_repeated_backward_is_equal(blending: str, generator: torch.Generator):
 
 def test_other_dtypes_and_devices_are_refused(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="backend cuda takes float32 tensors on a GPU, got torch.float64 on "):
-        cuda_backend.check(torch.zeros(1, 3, dtype=torch.float64))
+        cuda_backend._Image.check(torch.zeros(1, 3, dtype=torch.float64))
     monkeypatch.setattr(cuda, "device_type", lambda: "cuda")
     where = "" if torch.cuda.is_available() else r" \(torch finds no GPU with a driver here\)"
     with pytest.raises(ValueError, match=f"got torch.float32 on cpu{where}; convert them, or use backend=auto"):
-        cuda_backend.check(torch.zeros(1, 3))
+        cuda_backend._Image.check(torch.zeros(1, 3))
 
 
 def test_more_instances_than_a_list_can_hold_are_refused(generator, monkeypatch: pytest.MonkeyPatch):
