@@ -142,7 +142,7 @@ class LazyCounters(Mapping[str, int]):
         return iter(dict.fromkeys((*self._known, *self._names)))
 
     def __len__(self) -> int:
-        return len([*self])
+        return len({*self._known, *self._names})
 
 
 @dataclass(frozen=True)
