@@ -15,11 +15,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 
 def check(options: object, rule: str, holds: Callable[[Any], bool], *names: str) -> None:
-    """Refuse options of these names for which a rule does not hold.
-
-    Raises:
-        ValueError: "NAME is VALUE; it must be RULE".
-    """
+    """Raise a ValueError "NAME is VALUE; it must be RULE" if a rule does not hold for options of these names."""
     for name in names:
         value = getattr(options, name)
         if not holds(value):
@@ -27,11 +23,7 @@ def check(options: object, rule: str, holds: Callable[[Any], bool], *names: str)
 
 
 def check_known(options: object, **known: Collection[str]) -> None:
-    """Refuse options that are none of the names known for them.
-
-    Raises:
-        ValueError: "unknown NAME VALUE; known: ..."
-    """
+    """Raise a ValueError "unknown NAME VALUE; known: ..." for options that are none of the names known for them."""
     for name, names in known.items():
         value = getattr(options, name)
         if value not in names:
@@ -52,12 +44,7 @@ def unknown(what: str, name: object, known: Collection[str], meant: Sequence[str
 
 
 def lookup(registry: Mapping[str, str], name: str, kind: str) -> Any:
-    """Import and return the entry `name` of `registry`.
-
-    Args:
-        registry: name -> "package.module:attribute".
-        name: the entry wanted.
-        kind: what the registry holds, for the error message ("backend", "method", ...).
+    """Import and return the entry `name` of a registry of "backend", "method", or another kind.
 
     Raises:
         ValueError: `name` is not registered (the message lists the names that are), or is of another package that
@@ -111,10 +98,7 @@ class ConfigError(ValueError):
 def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
     """Return an instance of the dataclass `kind` with some of its fields set, nested dataclasses included.
 
-    Args:
-        kind: a dataclass; its checks in `__post_init__` run.
-        values: field -> value; fields that are left out keep their defaults.
-        where: key of `values` in the whole configuration, for messages.
+    `where` is the key of the values in the whole configuration, for messages.
 
     Raises:
         ConfigError: unknown keys (the known ones are listed), missing ones, or values of another type.

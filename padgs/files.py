@@ -26,16 +26,8 @@ _OTHER_FORMATS = {
     b"\0\0\0\x0cJXL": "JPEG XL",
     b"<": "HTML, XML or SVG",
 }
-DAMAGE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    LookupError,
-    EOFError,
-    ArithmeticError,
-    struct.error,
-)  # of Pillow
+# Errors of Pillow
+DAMAGE = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, ArithmeticError, struct.error)
 MAX_PIXELS = 180_000_000  # a panorama of 18972x9486
 
 DRAFT = ".padgs-draft-"  # begins the names of files and folders that are not complete
@@ -44,11 +36,7 @@ DAY = 86400.0  # seconds
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a hidden path beside `path` to write to; it replaces `path` at the end, or is removed after an error.
-
-    Raises:
-        OSError: it was not written, or cannot replace `path`.
-    """
+    """Yield a hidden path beside `path` to write to; it replaces `path` at the end, or is removed after an error."""
     check_place(path)
     with draft_of(path) as draft:
         yield draft
@@ -56,11 +44,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def check_place(path: Path) -> None:
-    """Check that a file can be written, before work that may take minutes.
-
-    Raises:
-        OSError: there is a folder of this name, or the folder of the file is missing or read-only.
-    """
+    """Raise an OSError if a file cannot be written, before work that may take minutes."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     with draft_of(path) as draft:
@@ -107,11 +91,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def read_regular(path: Path) -> bytes:
-    """Return the content of a regular file; reading a pipe or a device may never end.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return the content of a regular file; reading a pipe or a device may never end."""
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "it is no regular file", str(path))
     return path.read_bytes()

@@ -72,9 +72,7 @@ class Result:
     reason: str = ""  # why a run failed
     ended: str = ""  # why the run skipped part of its schedule, see `padgs.training.health`
     scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> scores
-    timing: dict[str, float] = field(
-        default_factory=dict
-    )  # train_seconds, cpu_seconds, render_ms_min, render_ms_median
+    timing: dict[str, float] = field(default_factory=dict)  # train_seconds, cpu_seconds, render_ms_{min,median}
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
     model_bytes: int = 0
     peak_memory_bytes: int = 0  # of the process, while training
@@ -183,31 +181,19 @@ class ResultError(ValueError):
 
 
 def write(result: Result, folder: Path) -> Path:
-    """Write `result.json` atomically into the run folder; return its path.
-
-    Raises:
-        OSError: the disk is full, the folder is read-only, ...; an older file stays.
-    """
+    """Write `result.json` atomically into the run folder; return its path. An older file stays after an OSError."""
     path = folder / FILE_NAME
     write_atomically(path, (json.dumps(encoded(result), indent=1, allow_nan=False) + "\n").encode())
     return path
 
 
 def read(path: Path) -> Result:
-    """Read one `result.json`.
-
-    Raises:
-        ResultError: it is missing, truncated, of another version, or was edited.
-    """
+    """Read one `result.json`; a ResultError says that it is missing, truncated, of another version, or was edited."""
     return decoded(parsed(file_content(path), str(path)), str(path))
 
 
 def file_content(path: Path) -> bytes:
-    """Return the bytes of a file.
-
-    Raises:
-        ResultError: it cannot be read.
-    """
+    """Return the bytes of a file, or raise a ResultError."""
     try:
         return read_regular(path)
     except OSError as error:
@@ -221,11 +207,7 @@ def encoded(result: Result) -> dict[str, Any]:
 
 
 def parsed(content: bytes, where: str) -> dict[str, Any]:
-    """Parse the JSON of a document; `where` names it in errors.
-
-    Raises:
-        ResultError: it is truncated or no result, or has numbers or texts that no result has.
-    """
+    """Parse the JSON of a document; raise a ResultError, which says `where`, if it is no result."""
     try:
         document = json.loads(content, parse_constant=_int, parse_int=_int)
         json.dumps(document, ensure_ascii=False, allow_nan=False).encode()  # not possible for lone surrogates

@@ -138,3 +138,15 @@ def test_an_environment_without_pip_is_made_anew(tmp_path):
     done = subprocess.run(["make", "run", "PYTHON=./python"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode and (tmp_path / "asked").read_text() == "-m venv .venv\n"
     assert "Error 3" in done.stderr, "nothing else is tried where there is no environment"
+
+
+def test_what_is_missing_is_installed_for_the_python_that_misses_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "executable", "/my place/python")
+    assert "'/my place/python' -m pip install 'padgs[launchers]'" in str(missing_plugin(["launcher=slurm"]))
+
+
+def test_extras_are_installed_without_compiling_again():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        commands = re.findall(r"""pip install[^`\n]*-e ["']\.\[(?:view|video|mlflow|ray)\b""", page.read_text())
+        assert not commands, page

@@ -45,11 +45,7 @@ def composing() -> Iterator[ConfigLoader]:
 
 
 def multirun(arguments: Sequence[str]) -> DictConfig | None:
-    """Compose a command line without what it sweeps; None if it is no multirun.
-
-    Raises:
-        HydraException: an unknown choice, or a violation of Hydra's grammar.
-    """
+    """Compose a command line without what it sweeps; None if it is no multirun. It may raise a HydraException."""
     hydra = GlobalHydra.instance().hydra
     assert hydra is not None, "call within `composing`"
     forced = {"-m", "--multirun"} & {*arguments}
@@ -63,21 +59,14 @@ def multirun(arguments: Sequence[str]) -> DictConfig | None:
 def configuration(settings: Sequence[str]) -> RunConfig:
     """Return the typed configuration of `padgs-run SETTINGS`, no multirun; call it within `composing`.
 
-    Raises:
-        ConfigError: an unknown key or name, or a value of the wrong type.
-        HydraException: an unknown choice, or a violation of Hydra's grammar.
+    It may raise a ConfigError, or a HydraException for an unknown choice.
     """
     composed = compose("config", lenient(quoted(settings)), return_hydra_config=True)
     return typed_config(composed, composed.hydra.runtime.choices)
 
 
 def composed_text(settings: Sequence[str], key: str) -> str:
-    """Return what Hydra composes under a key as YAML; "job" is all but Hydra's own keys.
-
-    Raises:
-        ValueError: there is no such key.
-        HydraException: an unknown choice, or a violation of Hydra's grammar.
-    """
+    """Return what Hydra composes under a key as YAML; "job" is all but Hydra's own keys."""
     composed = multirun(settings) or compose("config", lenient(quoted(settings)), return_hydra_config=True)
     if key == "job":
         return OmegaConf.to_yaml(OmegaConf.masked_copy(composed, [str(name) for name in composed if name != "hydra"]))

@@ -29,11 +29,7 @@ COMMENTED = re.compile(r"^((?:    # .*\n)*)    (\w+): [^#\n]*?(?:  # (.*(?:\n {5
 
 
 def manual(arguments: Sequence[str], width: int | None = None) -> str:
-    """Return the help text for a command line and a terminal of `width` columns, by default the current one.
-
-    Raises:
-        HydraException: an unknown method.
-    """
+    """Return the help text for a command line and a terminal of `width` columns, by default the current one."""
     with composing():
         config = configuration([text for text in arguments if text.startswith("method=")])
     width = width or min(shutil.get_terminal_size().columns, 120)

@@ -36,10 +36,7 @@ ONE_OF_SEVERAL = re.compile(r"\"[^\"]*\"|'[^']*'|[^,]+")
 
 
 def root() -> Path:
-    """Return the folder of `conf/` and `sweeps/`: the package if it is installed, else the checkout.
-
-    Hydra resolves relative paths against the importing module, which a console script does not have.
-    """
+    """Return the folder of `conf/` and `sweeps/`: the package if it is installed, else the checkout."""
     package = Path(__file__).resolve().parent.parent
     return package if (package / "conf").is_dir() else package.parent
 
@@ -171,15 +168,10 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
 
 
 def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
-    """Return the overrides of each job: all combinations of the swept values.
+    """Return the overrides of each job: all combinations of the swept values, at most `MOST_JOBS`.
 
-    Args:
-        params: `hydra.sweeper.params`, key -> values in the grammar of the command line.
-        arguments: of the command line; they replace the same keys of `params`.
-        loader: lists the choices of groups, for `glob(...)`.
-
-    Raises:
-        ValueError: there are more than `MOST_JOBS` jobs.
+    `params` is `hydra.sweeper.params`, key -> values in the grammar of the command line, whose arguments replace the
+    same keys. The loader lists the choices of groups for `glob(...)`.
     """
     swept = lenient([f"{key}={values}" for key, values in params.items() if values is not None])
     choices: dict[str, list[str]] = {}

@@ -46,11 +46,7 @@ def main() -> None:
 
 
 def _answer(arguments: Sequence[str]) -> None:
-    """Exit after options that run nothing.
-
-    Raises:
-        ValueError: settings that cannot be run.
-    """
+    """Exit after options that run nothing; raise a ValueError for settings that cannot be run."""
     import padgs
 
     if "--version" in arguments:

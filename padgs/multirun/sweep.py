@@ -67,12 +67,8 @@ SECONDS_BETWEEN_LINES = 30.0  # without a terminal
 def sweep(config: DictConfig, loader: ConfigLoader) -> Counter[str]:
     """Do the missing part of a multirun, composed by Hydra without the swept values: each combination of these once.
 
-    Returns:
-        Status -> number of jobs, those finished before included.
-
-    Raises:
-        ValueError: keys of `run` or `tracking` cannot be used.
-        Interrupted: stopped from outside; the same command continues.
+    Returns status -> number of jobs, those finished before included. It may raise a ValueError for keys of `run` or
+    `tracking`, and is `Interrupted` from outside; the same command continues.
     """
     typed(RunOptions, OmegaConf.to_container(config.run, resolve=True), "run")  # type: ignore[arg-type]
     jobs = expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader)

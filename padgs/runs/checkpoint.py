@@ -44,11 +44,7 @@ def digest(folder: Path) -> str:
 
 
 def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
-    """Write a checkpoint of a run with this identity; the previous one stays complete until it is replaced.
-
-    Raises:
-        CheckpointError: the disk is full, the folder is read-only, ...; the previous checkpoint is untouched.
-    """
+    """Write a checkpoint of a run with this identity; the previous one stays if that raises a CheckpointError."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.tensors.items()}
     content = safetensors.torch.save(tensors)
     digest = hashlib.sha256(content).hexdigest()

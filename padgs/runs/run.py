@@ -167,9 +167,7 @@ def start(config: RunConfig) -> torch.device:
 def load_scene(config: RunConfig, device: torch.device) -> Scene:
     """Load the scene of a run onto a device, under the run's stress; images are kept where `run.images_on` says.
 
-    Raises:
-        DataError: the input cannot be used.
-        ValueError: the stress condition cannot be applied to it, or it has too few views to set some apart.
+    A DataError or another ValueError says why the input, its stress or its number of views cannot be used.
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
     scene = data.load(config.data.path, config.data.format, config.data.options(images_on))

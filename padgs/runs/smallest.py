@@ -70,12 +70,7 @@ class Search:
     """The search on a finished run."""
 
     def __init__(self, run: LoadedRun, console: Console, stop_requested: Callable[[], bool] = lambda: False) -> None:
-        """Prepare the search; `stop_requested` is asked besides signals.
-
-        Raises:
-            ValueError: the model has no Gaussians that could be pruned, or the scene has too few training views.
-            DataError: the data set has changed since training.
-        """
+        """Prepare the search; a ValueError says why it cannot be. `stop_requested` is asked besides signals."""
         assert run.result is not None, "only a finished run is searched"
         run.method.refuse_search()
         run.refuse_other_data()
@@ -241,16 +236,8 @@ def find_smallest(
 ) -> Result:
     """Search the smallest model that loses at most `epsilon` dB, keep it as a run beside RUN, and print the table.
 
-    Args:
-        run: a finished run.
-        epsilon: one of `padgs.results.SMALLEST_LOSSES`.
-        console: receives progress and the table.
-        stop_requested: is asked whether to stop, besides signals.
-
-    Raises:
-        ValueError: the run cannot be searched, or a candidate failed.
-        RunBusy: another process searches it.
-        Interrupted: stopped from outside; a new search resumes.
+    `run` is finished, and `epsilon` one of `padgs.results.SMALLEST_LOSSES`. A ValueError says that the run cannot be
+    searched or a candidate failed, RunBusy that another process searches it. A new search resumes after `Interrupted`.
     """
     with run.files:
         result = Search(run, console, stop_requested).keep(epsilon)

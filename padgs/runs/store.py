@@ -90,14 +90,10 @@ class RunStore:
         return cls(Path(config.run.folder) / name, identity(values, scene.fingerprint))
 
     def __enter__(self) -> RunStore:
-        """Make the folder and lock it, without waiting.
+        """Make the folder and lock it without waiting; raise RunBusy if another process holds the lock.
 
         The kernel's lock on an open file is free as soon as its process dies. On file systems without such locks,
         `filelock` falls back to the existence of the file and takes over from dead processes of this host.
-
-        Raises:
-            RunBusy: another process holds the lock.
-            RunFolderError: the folder cannot be written.
         """
         owner = self.path / OWNER
         with self._writing():
@@ -183,9 +179,6 @@ class RunStore:
         """Load the checkpoint into a method, on a device; return its progress, or none without a checkpoint.
 
         Log lines of later iterations are dropped, as those iterations come again; so is a line cut by a kill.
-
-        Raises:
-            CheckpointError: the checkpoint is damaged or of another run.
         """
         progress = Progress()
         if self.has_checkpoint:

@@ -27,11 +27,7 @@ class WarmStart:
 
     @classmethod
     def of(cls, folder: str, method: str) -> WarmStart:
-        """Return the warm start of a method from a run folder.
-
-        Raises:
-            ConfigError: the run did not end well, is of another method, or has no checkpoint.
-        """
+        """Return the warm start of a method from the folder of a run that ended well; else raise a ConfigError."""
         store = RunStore(Path(folder))
         try:
             result = _finished(store)
@@ -51,16 +47,13 @@ class WarmStart:
         device: torch.device,
         stress: Mapping[str, Any] | None = None,
     ) -> State:
-        """Return the state that the run ended with.
+        """Return the state that the run ended with; raise a ConfigError for other data, another stress or a change.
 
         Args:
             fingerprint: of the scene of the new run.
             fingerprint_at: returns the same for another `data.width`; called only if the fingerprints differ.
             device: of the tensors.
             stress: of the new run, as in its configuration; None for none.
-
-        Raises:
-            ConfigError: the run has other data or another stress, or its checkpoint has changed since.
         """
         store = RunStore(Path(self.run))
         try:

@@ -111,7 +111,12 @@ PANORAMA, GREY = Image.fromarray(PIXELS), Image.fromarray(PIXELS[..., 0])
         ("a.tif", PANORAMA.convert("I"), "has 16 bits or more", "has pixels of type I"),
         ("a.jpg", PANORAMA.convert("CMYK"), "is CMYK; convert it to RGB", "has pixels of type CMYK"),
         ("a.tif", PANORAMA.convert("LAB"), "is LAB; convert it to RGB", "has pixels of type LAB; save masks as grey"),
-        ("a.png", Image.fromarray(PIXELS[:, :64]), "is 64x64, which is not 2:1; .*360 x 180.* one above the other", "not 2:1"),
+        (
+            "a.png",
+            Image.fromarray(PIXELS[:, :64]),
+            "is 64x64, which is not 2:1; .*360 x 180.* one above the other",
+            "not 2:1",
+        ),
         ("a.png", Image.fromarray(PIXELS[:32]), "is 128x32, which is not 2:1.*two panoramas side by side", "not 2:1"),
         ("a.png", Image.fromarray(PIXELS[:63]), "is 128x63, which is not 2:1", "is not 2:1"),
     ],

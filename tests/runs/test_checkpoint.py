@@ -53,29 +53,29 @@ def test_a_restored_generator_goes_on_where_it_was(tmp_path):
     assert torch.equal(torch.rand(9, generator=restored), torch.rand(9, generator=generator))
 
 
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda file: file.write_bytes(file.read_bytes()[:-1]),
+            r"has \d+ bytes instead of .*delete the",
+        ),
+        (lambda file: file.write_bytes(file.read_bytes()[:-1] + b"\xff"), "SHA-256 differs"),
+        (lambda file: file.unlink(), "cannot read .*tensors-"),
+    ],
+)
+def test_damaged_or_missing_tensors_are_refused_by_name(tmp_path, spoil, message):
+    checkpoint.save(example(), tmp_path)
+    spoil(tensors_file(tmp_path))
+    with pytest.raises(CheckpointError, match=message):
+        checkpoint.load(tmp_path)
+
+
 def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path):
     checkpoint.save(example(0), tmp_path)
     checkpoint.save(example(1), tmp_path)
     assert_same(checkpoint.load(tmp_path), example(1))
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_truncated_tensors_are_refused_by_name(tmp_path):
-    checkpoint.save(example(), tmp_path)
-    file = tensors_file(tmp_path)
-    file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match=rf"{file.name} has \d+ bytes instead of .* delete the checkpoint folder"):
-        checkpoint.load(tmp_path)
-
-
-def test_one_flipped_bit_is_refused(tmp_path):
-    checkpoint.save(example(), tmp_path)
-    file = tensors_file(tmp_path)
-    content = bytearray(file.read_bytes())
-    content[-1] ^= 1
-    file.write_bytes(content)
-    with pytest.raises(CheckpointError, match="SHA-256 differs"):
-        checkpoint.load(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -147,14 +147,6 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
             checkpoint.load(tmp_path, run={**run, what: "c"})
 
 
-def test_missing_tensors_are_named(tmp_path):
-    checkpoint.save(example(), tmp_path)
-    file = tensors_file(tmp_path)
-    file.unlink()
-    with pytest.raises(CheckpointError, match=file.name):
-        checkpoint.load(tmp_path)
-
-
 def test_full_disk_leaves_the_previous_checkpoint_whole(tmp_path):
     """A limit on the size of files makes `write` fail as a full disk does, after part of the file is written."""
     checkpoint.save(example(), tmp_path)
@@ -195,9 +187,3 @@ def test_values_that_json_cannot_hold_are_refused_before_anything_is_written(tmp
     with pytest.raises(ValueError, match="JSON"):
         checkpoint.save(State({}, {"loss": math.nan}), tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_manifest_is_readable_by_people(tmp_path):
-    checkpoint.save(example(), tmp_path)
-    manifest = json.loads((tmp_path / "state.json").read_text())
-    assert manifest["values"]["iteration"] == 7 and manifest["bytes"] == tensors_file(tmp_path).stat().st_size
