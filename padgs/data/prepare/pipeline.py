@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from PIL import Image
-from torch import Tensor
+from scipy.spatial.transform import Rotation
 
 from padgs.data.assemble import IMAGE_FOLDERS, view_name
 from padgs.data.camera_paths import gravity
@@ -325,25 +325,9 @@ def level_world(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, .
     estimate = gravity(torch.stack([frame.cam_from_world for frame in frames]))
     if estimate.agreement < LEVEL_AGREEMENT:
         return frames, cloud, "the cameras have no common up direction; the world is not rotated"
-    new_from_old = rotation_between(torch.tensor(estimate.up, dtype=torch.float64))
+    new_from_old = torch.from_numpy(Rotation.align_vectors([(0.0, 0.0, 1.0)], [estimate.up])[0].as_matrix())
     old_from_new = torch.eye(4, dtype=torch.float64)
     old_from_new[:3, :3] = new_from_old.mT
     frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ old_from_new) for frame in frames)
     cloud = Cloud(cloud.points @ new_from_old.mT, cloud.colors)
     return frames, cloud, "the world's +z is the cameras' common up direction; its scale is arbitrary"
-
-
-def rotation_between(up: Tensor) -> Tensor:
-    """Return the smallest rotation [3, 3] that maps a unit vector [3] to +z.
-
-    >>> rotation_between(torch.tensor([0.0, -1.0, 0.0]))
-    tensor([[ 1.,  0.,  0.],
-            [ 0.,  0.,  1.],
-            [ 0., -1.,  0.]])
-    """
-    x, y, z = up.tolist()
-    if z < -1 + 1e-9:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=up.dtype))
-    k = 1 / (1 + z)
-    rows = ((1 - k * x * x, -k * x * y, -x), (-k * x * y, 1 - k * y * y, -y), (x, y, z))
-    return torch.tensor(rows, dtype=up.dtype) + 0.0

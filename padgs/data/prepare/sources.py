@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from PIL import Image
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, DataError, Frame, listed
 from padgs.data.check import OVERLAY
-from padgs.data.image_metadata import stated
 from padgs.data.images import (
     EXTENSIONS,
     ImageFile,
@@ -32,22 +30,12 @@ from padgs.data.masks import MASK_FOLDERS, PREVIEW, SCENE_MASKS, Mask, find_mask
 from padgs.data.store import ImageStore
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
-
-
-_STATEMENTS = {"SPHERICAL": 1, "STEREO3D": 1, "DISPLAYMATRIX": 9}  # of a frame -> 32-bit numbers that are read
 _HDR_TRANSFER = {8: "linear", 16: "PQ", 18: "HLG"}  # numbers of ITU-T H.273
-_PROJECTIONS = (
-    "equirectangular",
-    "cubemap",
-    "part of an equirectangular one",
-    "half equirectangular",
-    "rectilinear",
-    "fisheye",
-)
-_BOXES = (b"ftyp", b"free", b"skip", b"wide", b"mdat", b"uuid", b"pdin", b"meta", b"moof", b"sidx", b"styp")
-_MAX_MOOV = 1 << 28  # bytes
-_EYES_BY_NAME = {None: (1, 1), "mono": (1, 1), "top-bottom": (2, 1), "left-right": (1, 2)}
-_ONE_EYE = {0: (1, 1), 1: (1, 2), 2: (2, 1)}  # FFmpeg's stereo layout -> views one above the other, and side by side
+_ONE_PANORAMA = {  # of FFmpeg's metadata of frames: first numbers, and what to do with a video that has others
+    "SPHERICAL": ((0,), "in another projection than equirectangular: convert it"),
+    "STEREO3D": ((0,), "stereo: export one eye"),
+    "DISPLAYMATRIX": ((65536, 0, 0, 0, 65536), "turned or mirrored: export it upright"),
+}
 
 
 def is_video(path: Path) -> bool:
@@ -88,14 +76,13 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
                 raise DataError(f"{video} holds no video stream; give a stitched 360-degree video")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            eyes = _eyes_by_xml(video)
             rate = float(stream.average_rate or 30)
             total = stream.frames or round(rate * float((container.duration or 0) / av.time_base))
             best, best_sharpness, interval, start = None, -1.0, 0, None
             for index, frame in enumerate(container.decode(stream)):
                 time = index / rate if frame.time is None else frame.time
                 start = time if start is None else start
-                pixels = _panorama_of(frame, video, eyes)
+                pixels = _pixels(frame, video)
                 if index == 0:  # before an hour of decoding
                     refuse_other_shapes(pixels.shape[1], pixels.shape[0], video)
                     refuse_dual_fisheye(pixels, video)
@@ -117,72 +104,22 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
 
 
-def _eyes_by_xml(video: Path) -> tuple[int, int]:
-    """Return the views one above the other and side by side by the XML of an MP4 file, which FFmpeg reads in part.
+def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
+    """Return the pixels of a frame.
 
     Raises:
-        DataError: it says that the panoramas are in another projection, or cropped.
-    """
-    xml = ""
-    with open(video, "rb") as file:
-        while len(head := file.read(8)) == 8:
-            size = int.from_bytes(head[:4], "big") - 8
-            if size == -7:  # 64 bits follow
-                size = int.from_bytes(file.read(8), "big") - 16
-            if head[4:] == b"moov":
-                content = file.read(max(0, min(size, _MAX_MOOV)))
-                start = content.find(b"SphericalVideo")
-                xml = content[start : content.find(b"SphericalVideo>", start + 1)].decode("utf-8", errors="replace")
-                break
-            if size < 0 or head[4:] not in _BOXES:
-                break
-            file.seek(size, 1)
-    if (kind := stated(xml, "ProjectionType")) not in (None, "equirectangular"):
-        raise DataError(f"{video} says that its projection is {kind}, not equirectangular; convert it")
-    for side in ("Width", "Height"):
-        full, part = stated(xml, f"FullPano{side}Pixels"), stated(xml, f"CroppedAreaImage{side}Pixels")
-        if full != part:
-            raise DataError(f"{video} says that it shows {part} of {full} pixels of its panoramas; export all of them")
-    mode = stated(xml, "StereoMode")
-    if mode not in _EYES_BY_NAME:
-        raise DataError(f"{video} says that it is stereo of a kind that is not read ({mode}); export one eye")
-    return _EYES_BY_NAME[mode]
-
-
-def _panorama_of(frame: Any, video: Path, eyes: tuple[int, int] = (1, 1)) -> NDArray[np.uint8]:
-    """Return the pixels of a frame, turned upright and of one eye, as the video says.
-
-    Raises:
-        DataError: the video says that it is mirrored, in another projection, or in colours of HDR.
+        DataError: the video says that they are not one upright panorama, or are in colours of HDR.
     """
     if getattr(frame, "color_trc", None) in _HDR_TRANSFER:
         raise DataError(
             f"{video} is HDR (transfer {_HDR_TRANSFER[frame.color_trc]}); export it in standard dynamic range"
         )
-    pixels = frame.to_ndarray(format="rgb24")
-    said = {
-        side.type.name: np.frombuffer(bytes(side), np.int32, count=_STATEMENTS[side.type.name])
-        for side in frame.side_data
-        if side.type.name in _STATEMENTS
-    }
-    if "SPHERICAL" in said and (kind := int(said["SPHERICAL"][0])) != 0:
-        kinds = dict(enumerate(_PROJECTIONS))
-        raise DataError(f"{video} says that its projection is {kinds.get(kind, kind)}, not equirectangular; convert it")
-    if "STEREO3D" in said:
-        layout = int(said["STEREO3D"][0])
-        if layout not in _ONE_EYE:
-            raise DataError(f"{video} says that it is stereo of a kind that is not read ({layout}); export one eye")
-        eyes = _ONE_EYE[layout]
-    pixels = pixels[: len(pixels) // eyes[0], : pixels.shape[1] // eyes[1]]
-    if "DISPLAYMATRIX" in said:
-        (a, b), (c, d) = said["DISPLAYMATRIX"].reshape(3, 3)[:2, :2].astype(float)
-        quarters = math.degrees(math.atan2(c, a)) / 90
-        if a * d - b * c <= 0 or abs(quarters - round(quarters)) > 0.01:
-            raise DataError(
-                f"{video} says that it is mirrored or turned by {90 * quarters:g} degrees; export it upright"
-            )
-        pixels = np.rot90(pixels, round(quarters))
-    return np.ascontiguousarray(pixels)
+    for side in frame.side_data:
+        if side.type.name in _ONE_PANORAMA:
+            numbers, otherwise = _ONE_PANORAMA[side.type.name]
+            if tuple(np.frombuffer(bytes(side), np.int32, len(numbers)).tolist()) != numbers:
+                raise DataError(f"{video} says that it is {otherwise}")
+    return frame.to_ndarray(format="rgb24")
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:

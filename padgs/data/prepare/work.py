@@ -39,15 +39,11 @@ def threads_for(width: int, height: int) -> int:
 
 
 def free_memory() -> int | None:
-    """Return the free memory in bytes, half of the total if only that is known, or None."""
+    """Return the free memory in bytes, or None where that is not known."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             return next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:"))
     except (OSError, StopIteration):  # not Linux
-        pass
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    except (AttributeError, OSError, ValueError):
         return None
 
 

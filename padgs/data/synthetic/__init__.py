@@ -18,9 +18,8 @@ from padgs.checks import ConfigError, typed
 from padgs.data.capture import DataError, DataOptions
 from padgs.data.store import ImageStore, StoredImage
 from padgs.data.synthetic import cache, camera, paths
-from padgs.data.synthetic.camera import draw_stitched
+from padgs.data.synthetic.camera import draw_stitched, sample_points
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
-from padgs.data.synthetic.points import sample_points
 from padgs.data.synthetic.truth import SyntheticTruth
 from padgs.scene import Scene, View
 

@@ -49,7 +49,7 @@ def key(options: SyntheticOptions) -> str:
 
 @cache
 def _source() -> bytes:
-    return b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    return b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.iterdir()) if path.is_file())
 
 
 def _digest(entry: Path) -> str:

@@ -1,4 +1,4 @@
-"""Ray casting of panoramas: supersampled colour, exact depth and object ids, and stitched dual-fisheye cameras.
+"""Ray casting: panoramas with supersampled colour, exact depth and object ids, dual-fisheye cameras, and point clouds.
 
 Poses are in metres. The sub-pixel jitter of a pixel depends on its row only: rotating the camera by whole pixels about
 the vertical shifts the image exactly.
@@ -14,9 +14,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 
+from padgs.data.capture import DataError
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
-from padgs.data.synthetic.world import World
+from padgs.data.synthetic.world import SKY, World
 from padgs.geometry.lens import axis_direction, bend, hemisphere_weight
 from padgs.geometry.panorama import rays
 
@@ -111,3 +112,66 @@ def draw_stitched(world: World, cam_from_world: Array, gap: float, options: Synt
     directions = rays(options.width, options.height, dtype=torch.float64)
     weight = hemisphere_weight(directions, axis, math.radians(options.lens_blend)).numpy()[..., None]
     return np.round(weight * images[0] + (1 - weight) * images[1]).astype(np.uint8)
+
+
+def sample_points(
+    world: World, poses: Array, images: list[Array], options: SyntheticOptions, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Sample points [P, 3] float64 in metres and their colours [P, 3] uint8, like those of structure from motion.
+
+    Pixels are drawn with a probability proportional to solid angle times local contrast, because features are found at
+    texture; their exact surface points are kept if a second, random view sees them too, and get noise. `poses`
+    [n, 4, 4] and `images`, n times [H, W, 3] uint8, are those of the training views.
+    """
+    outliers = round(options.outliers * options.points)
+    wanted = options.points - outliers
+    chance = [_cumulative_contrast(image) for image in images]
+    kept, colors, found = [], [], 0
+    for _round in range(20):
+        batch = max(256, int(1.5 * (wanted - found) / len(poses)) + 1)
+        for k in rng.permutation(len(poses)):
+            pixel = np.searchsorted(chance[k], rng.random(batch)).clip(max=len(chance[k]) - 1)
+            points, distance, pixel = _seen_twice(world, poses, k, pixel, options.width, rng)
+            kept.append((points + options.point_noise * distance * rng.standard_normal(points.shape)).T)
+            colors.append(images[k].reshape(-1, 3)[pixel])
+            found += len(pixel)
+        if found >= wanted:
+            break
+    if not found:
+        raise DataError("no surface point is seen by two cameras; choose another scene or path")
+    choice = rng.permutation(found)[:wanted]
+    points, color = np.concatenate(kept)[choice], np.concatenate(colors)[choice]
+    low, high = np.quantile(points, 0.02, axis=0), np.quantile(points, 0.98, axis=0)
+    stray = rng.uniform(low - (high - low) / 2, high + (high - low) / 2, (outliers, 3))
+    return np.concatenate((points, stray)), np.concatenate((color, rng.integers(0, 256, (outliers, 3), np.uint8)))
+
+
+def _cumulative_contrast(image: Array) -> Array:
+    """Return the cumulative probability [H * W] of a feature at the pixels: solid angle x gradient magnitude."""
+    gray = image.astype(np.float32).mean(-1)
+    across = np.roll(gray, -1, 1) - np.roll(gray, 1, 1)
+    down = np.gradient(gray, axis=0) * 2
+    height = len(gray)
+    weight = np.cos(((np.arange(height) + 0.5) / height - 0.5) * np.pi)[:, None]
+    # Pixels are narrower near the poles: the same contrast there is a steeper edge, but fewer features.
+    chance = (np.hypot(across, down) + 1e-3) * weight
+    return np.cumsum((chance / chance.sum()).ravel())
+
+
+def _seen_twice(
+    world: World, poses: Array, view: int, pixel: Array, width: int, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Return the surface points [3, n] at pixels of a view that another view sees, their distances, and pixels."""
+    rows, columns = np.divmod(pixel, width)
+    rays = poses[view, :3, :3].T @ directions(rows + 0.5, columns + 0.5, width, width // 2)
+    start = center(poses[view])[:, None]
+    distance, object_id = world.nearest(start, rays)
+    hit = object_id != SKY
+    distance, pixel = distance[hit], pixel[hit]
+    points = start + distance * rays[:, hit]
+    second = (view + rng.integers(1, len(poses), points.shape[1])) % len(poses)
+    other = np.stack([center(pose) for pose in poses])[second].T
+    toward = points - other
+    far = np.linalg.norm(toward, axis=0)
+    visible = world.nearest(other, toward / far)[0] > far * (1 - 1e-4) - 1e-3
+    return points[:, visible], distance[visible], pixel[visible]

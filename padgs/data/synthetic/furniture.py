@@ -14,12 +14,8 @@ from padgs.data.synthetic.textures import Array, Texture
 OAK = ((0.42, 0.26, 0.13), (0.78, 0.56, 0.33))
 WALNUT = ((0.2, 0.12, 0.07), (0.5, 0.32, 0.18))
 BRIGHT = (
-    (0.85, 0.2, 0.16),
-    (0.95, 0.75, 0.2),
-    (0.16, 0.45, 0.75),
-    (0.2, 0.6, 0.35),
-    (0.9, 0.5, 0.15),
-    (0.55, 0.25, 0.6),
+    *((0.85, 0.2, 0.16), (0.95, 0.75, 0.2), (0.16, 0.45, 0.75)),
+    *((0.2, 0.6, 0.35), (0.9, 0.5, 0.15), (0.55, 0.25, 0.6)),
 )
 SPINES = (*BRIGHT, (0.3, 0.16, 0.1), (0.1, 0.2, 0.3), (0.75, 0.7, 0.6), (0.15, 0.3, 0.2))
 
@@ -155,7 +151,7 @@ def scatter(
         for _attempt in range(200):
             where = rng.uniform(low, high)
             apart = (np.linalg.norm(positions - where, axis=1) > sizes + size).all()
-            if apart and np.linalg.norm(path - where, axis=1).min() > clearance + size:
+            if apart and _distance(path, where) > clearance + size:
                 break
         else:
             raise DataError(f"no free position for object {len(sizes) + 1} of {count}; lower data.generator.objects")
@@ -170,15 +166,17 @@ def scatter(
 def beside(count: int, path: Array, nearest: float, farthest: float, rng: np.random.Generator) -> list[Shape]:
     """Place small objects with surfaces `nearest` to `farthest` metres from the camera path."""
     shapes: list[Shape] = []
-    attempts = 0
-    while len(shapes) < count:
-        attempts += 1
-        if attempts > 200 * count:
-            raise DataError(f"no free positions for {count} objects beside the path; lower data.generator.objects")
+    for _attempt in range(200 * count + 1):
+        if len(shapes) == count:
+            return shapes
         size = rng.uniform(0.02, 0.07)
         direction = rng.normal(size=3) * (1, 1, 0.7)
         gap = rng.uniform(nearest, farthest)
         where = path[rng.integers(len(path))] + direction / np.linalg.norm(direction) * (gap + size)
-        if np.linalg.norm(path - where, axis=1).min() >= nearest + size:
+        if _distance(path, where) >= nearest + size:
             shapes.append(loose_object(point(where), size, rng))
-    return shapes
+    raise DataError(f"no free positions for {count} objects beside the path; lower data.generator.objects")
+
+
+def _distance(path: Array, where: Array) -> float:
+    return float(np.linalg.norm(path - where, axis=1).min())

@@ -10,7 +10,7 @@ from typing import Any
 from padgs.data.capture import DataError
 
 SCENES = (
-    *("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy"),
+    *("room", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy"),
     *("white_room", "checker_room", "room_chain"),
 )
 PATHS = ("roaming", "cross", "line")

@@ -1,254 +1,159 @@
-"""Built-in scenes, as blueprints of one generator.
+"""Built-in scenes: worlds of shapes from the descriptions in scenes.yaml.
 
-room, two_rooms (a door between them), outdoor (far ring and sky), pole_torture (Siemens stars and rods at both poles),
-bare_room (posters on a tenth of the walls), near_clutter (objects 5-30 cm from the path), glossy (mirror-like
-materials, so colours depend on the view), white_room and checker_room (known complexity), room_chain (any number of
-rooms in a row).
+`outdoor` and `room_chain` (any number of rooms in a row) are described in Python.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
 from padgs.data.synthetic.options import SyntheticOptions
-from padgs.data.synthetic.outdoor import outdoor
 from padgs.data.synthetic.paths import Walk
-from padgs.data.synthetic.shapes import Box, Material, Rod, Room, Shape
+from padgs.data.synthetic.shapes import Box, Ground, Material, Ring, Rod, Room, Shape, Sphere
 from padgs.data.synthetic.textures import Array, Texture, scaled
 from padgs.data.synthetic.world import Light, World
 
-Furnish = Callable[[SyntheticOptions, Array, np.random.Generator], World]  # options, dense path [n, 3], random
+ROOM_LENGTH, WIDTH, HEIGHT = 5.0, 5.0, 2.8  # metres, of a room of a chain
+ROOMS = 2  # default
+ASIDE = 0.9  # metres between the cameras' path and the line of the doors, in the middle of a room
+CLEARANCE = 0.35  # metres between loose objects and the cameras' path
 
 
-@dataclass(frozen=True)
-class Blueprint:
-    """Recipe of a scene."""
-
-    walk: Walk | Callable[[SyntheticOptions], Walk]
-    path: str  # default kind of path
-    objects: int  # default number of loose objects
-    furnish: Furnish
+@cache
+def descriptions() -> dict[str, Any]:
+    """Return the content of scenes.yaml."""
+    return yaml.safe_load(Path(__file__).with_name("scenes.yaml").read_text(encoding="utf-8"))
 
 
-WHITE: tx.Color = (0.8, 0.8, 0.78)
-PAPER: tx.Color = (0.93, 0.91, 0.86)
-INK: tx.Color = (0.16, 0.13, 0.12)
+class Builder:
+    """Evaluates descriptions; `x` is the position of a room's centre."""
+
+    def __init__(self, options: SyntheticOptions, rng: np.random.Generator, x: float = 0.0) -> None:
+        f = options.texture_frequency
+        self.functions: dict[str, Callable[..., Any]] = {
+            "detailed": lambda texture: scaled(texture, f),
+            "per_detail": lambda length: length * f,
+            "by_detail": lambda length: length / f,
+            "spokes": lambda: options.spokes,
+            "posters": self.posters,
+            "pole_rods": pole_rods,
+            "matt": fu.matt,
+            "metal": fu.metal,
+            "box": Box,
+            "rod": Rod,
+            "sphere": Sphere,
+            "loose_object": lambda *values: [fu.loose_object(*values, rng)],
+        }
+        for make in (fu.table, fu.bookshelf, fu.sofa, fu.floor_lamp, fu.pendant):
+            self.functions[make.__name__] = lambda dx, *values, make=make: make(x + dx, *values)
+        for make in (fu.crates, fu.plant):
+            self.functions[make.__name__] = lambda dx, *values, make=make: make(x + dx, *values, rng)
+
+    def __call__(self, description: Any) -> Any:
+        """Return a texture, a shape or another value."""
+        if isinstance(description, str):
+            return self(descriptions()["textures"][description])
+        if not isinstance(description, list):
+            return description
+        if not (description and isinstance(description[0], str) and description[0] not in descriptions()["textures"]):
+            return tuple(map(self, description))
+        function = self.functions.get(description[0]) or getattr(tx, description[0])
+        return function(*map(self, description[1:]))
+
+    def shapes(self, description: list[Any]) -> list[Shape]:
+        """Return the shapes of a list of shapes and pieces of furniture."""
+        made = map(self, description)
+        return [shape for part in made for shape in (part if isinstance(part, list) else [part])]
+
+    def posters(self, count: int, width: float, size: float, shown: int | None = None) -> list[Any]:
+        """Return the first of `count` posters of height `size` in a row along a wall of the given width."""
+        self.functions["height"] = lambda part: size / part
+        looks = [self(picture) for picture in descriptions()["pictures"]]
+        positions = (np.arange(count) + 0.5) / count * width - width / 2
+        row = [(float(u), 0.15, 0.72 * size, size, looks[k % len(looks)]) for k, u in enumerate(positions)]
+        return row[:shown]
 
 
-def _posters(count: int, width: float, size: float) -> list[tuple[float, float, float, float, Texture]]:
-    """Return `count` posters of height `size` in a row along a wall of the given width."""
-    looks = (
-        tx.poster((0.35, 0.6, 0.85), (0.12, 0.32, 0.22), (0.98, 0.75, 0.25), size),
-        tx.print_of(PAPER, INK, size / 16),
-        tx.poster((0.9, 0.55, 0.4), (0.25, 0.14, 0.3), (1.0, 0.9, 0.6), size),
-        tx.medallion((0.12, 0.18, 0.3), (0.85, 0.7, 0.4), (0.9, 0.9, 0.85), size / 2.2, 7),
-    )
-    positions = (np.arange(count) + 0.5) / count * width - width / 2
-    return [(float(u), 0.15, 0.72 * size, size, looks[k % len(looks)]) for k, u in enumerate(positions)]
+def world(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """Build the world of a scene around the dense path [n, 3] of its cameras."""
+    if options.scene in ("outdoor", "room_chain"):
+        return (outdoor if options.scene == "outdoor" else room_chain)(options, path, rng)
+    of, build, count = descriptions()["scenes"][options.scene], Builder(options, rng), options.objects or 0
+    skins = [Material(build(face)) for face in of["faces"]]
+    skins[4] = Material(skins[4].texture, of.get("gloss", 0.0))
+    shapes = [Room((-3.0, -2.5, 0.0), (3.0, 2.5, 2.8), tuple(skins)), *build.shapes(of.get("shapes", []))]
+    if of["scatter"] is None:
+        nearest = 0.05 if options.nearest is None else options.nearest
+        shapes += fu.beside(count, path, nearest, nearest + 0.25, rng)
+    else:
+        shapes += fu.scatter(count, path, *build(of["scatter"]), CLEARANCE, rng, of.get("reflectance", 0.0))
+    return World(tuple(shapes), Light(build(of["lamps"]), ambient=of.get("ambient", Light.ambient)))
 
 
-def _rug(f: float) -> Texture:
-    return scaled(tx.medallion((0.55, 0.13, 0.12), (0.14, 0.17, 0.32), (0.9, 0.76, 0.45), 1.7 * f, 8), f)
-
-
-def _room_materials(
-    options: SyntheticOptions,
-    width: float,
-    depth: float,
-    gloss: float = 0.0,
-    rugs: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
-) -> tuple[Material, ...]:
-    f = options.texture_frequency
-    brick = scaled(tx.bricks((0.45, 0.2, 0.14), (0.78, 0.45, 0.33), (0.78, 0.74, 0.68)), f)
-    paper = scaled(tx.wallpaper((0.55, 0.62, 0.52), (0.86, 0.83, 0.68)), f)
-    tiles = scaled(tx.checker((0.28, 0.42, 0.5), (0.86, 0.87, 0.83), 0.2), f)
-    rough = scaled(tx.plain((0.82, 0.79, 0.73), 0.22, 2.0), f)
-    rosette = scaled(tx.medallion((0.88, 0.86, 0.8), (0.62, 0.58, 0.5), (0.8, 0.6, 0.25), 1.5 * f, 12), f)
-    view = tx.window((0.45, 0.68, 0.95), (0.9, 0.88, 0.83))
-    return (
-        Material(tx.framed(brick, _posters(2, depth * 0.8, 0.9)[:1])),
-        Material(tx.framed(rough, [*_posters(3, depth * 0.85, 0.8)])),
-        Material(tx.framed(tiles, ((0.9, 0.25, 1.0, 1.1, view), (-0.9, 0.25, 1.0, 1.1, view)))),
-        Material(tx.framed(paper, _posters(3, width * 0.7, 0.75))),
-        Material(tx.disc(scaled(tx.planks(*fu.OAK), f), _rug(f), 1.7, rugs), gloss),
-        Material(tx.disc(scaled(tx.checker((0.84, 0.82, 0.77), (0.8, 0.78, 0.73), 0.6), f), rosette, 1.5, rugs)),
-    )
-
-
-def _furniture(rng: np.random.Generator) -> list[Shape]:
-    """Return the furniture of the 6 x 5 x 2.8 m room, and the rods that cross it."""
-    steel = fu.metal()
-    return [
-        *fu.bookshelf(-1.5, 2.3, 1.6, 2.0),
-        *fu.sofa(1.3, 1.95),
-        *fu.table(2.35, -1.5, 0.9, 1.2, 0.75),
-        fu.loose_object((2.35, -1.3, 0.9), 0.15, rng),
-        Box((2.35, -1.75, 0.88), (0.12, 0.17, 0.13), fu.matt(tx.print_of(PAPER, INK, 0.04)), 0.4),
-        *fu.crates(-2.45, -1.9, rng),
-        *fu.plant(-2.5, 1.3, 1.5, rng),
-        *fu.floor_lamp(2.6, 0.7),
-        *fu.pendant(0.0, 0.0, 2.8, 0.4),
-        Rod((-3, -0.9, 2.35), (3, -0.9, 2.35), 0.015, steel),
-        Rod((-3, 0.95, 2.3), (3, 0.95, 2.3), 0.01, steel),
-        Rod((-1.9, -2.4, 2.15), (1.9, -2.4, 2.15), 0.02, fu.metal((0.8, 0.65, 0.3))),
-        Rod((0.35, -1.75, 0), (0.35, -1.75, 2.8), 0.012, steel),
-        Rod((-2.1, 0.1, 0), (-2.1, 0.1, 2.8), 0.015, fu.metal((0.75, 0.3, 0.25))),
-    ]
-
-
-_LOW, _HIGH = (-3.0, -2.5, 0.0), (3.0, 2.5, 2.8)
-_LIGHT = Light((((0.0, 0.0, 2.4), 0.85), ((2.6, 0.7, 1.75), 0.35)))
-
-
-def room(
-    options: SyntheticOptions, path: Array, rng: np.random.Generator, gloss: float = 0.0, reflectance: float = 0.0
-) -> World:
-    """Build a furnished room, 6 x 5 x 2.8 m, with a floor of that gloss and objects of that reflectance."""
-    shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5, gloss)), *_furniture(rng)]
-    shapes += fu.scatter(options.objects or 0, path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng, reflectance)
-    return World(tuple(shapes), _LIGHT)
-
-
-def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build the room with small objects in a layer of 25 cm beside the camera path, by default from 5 cm on."""
-    shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
-    nearest = 0.05 if options.nearest is None else options.nearest
-    return World((*shapes, *fu.beside(options.objects or 0, path, nearest, nearest + 0.25, rng)), _LIGHT)
-
-
-def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build a room of smooth surfaces of one colour; posters cover a tenth of the walls."""
-    white, gray = tx.plain(WHITE), tx.plain((0.55, 0.55, 0.55))
-    # 4 walls are 61.6 m2; 9 posters of 0.72 x 0.975 m cover a tenth.
-    rows = ((2, 5), (2, 5), (2, 6), (3, 6))
-    walls = [Material(tx.framed(white, _posters(count, extent, 0.975))) for count, extent in rows]
-    return _lit_room((*walls, Material(gray), Material(white)), 1.2, options, path, rng)
-
-
-def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build a room with Siemens stars on floor and ceiling, and thin rods around the cameras."""
-    f = options.texture_frequency
-    star = tx.siemens_star(INK, PAPER, options.spokes, 0.8 / f)
-    walls = _room_materials(options, 6, 5)[:4]
-    shapes: list[Shape] = [Room(_LOW, _HIGH, (*walls, Material(star), Material(star)))]
+def pole_rods() -> list[Shape]:
+    """Return thin rods above, below and around the cameras."""
+    shapes: list[Shape] = []
     for k, offset in enumerate(np.linspace(-1.2, 1.2, 5)):
         skin = fu.metal(fu.BRIGHT[k])
         shapes += [
             Rod((offset, -2.5, 2.3), (offset, 2.5, 2.3), 0.004 + 0.002 * k, skin),
             Rod((-3, offset, 0.4), (3, offset, 0.4), 0.004 + 0.002 * k, skin),
             Rod((-3, 0.8 * offset, 2.45), (3, 0.8 * offset, 2.45), 0.006, skin),
-            Rod((1.7 * offset, 1.9, 0), (1.7 * offset, 1.9, 2.8), 0.01, skin),
-            Rod((1.7 * offset, -1.9, 0), (1.7 * offset, -1.9, 2.8), 0.01, skin),
+            *(Rod((1.7 * offset, y, 0), (1.7 * offset, y, 2.8), 0.01, skin) for y in (1.9, -1.9)),
         ]
-    shapes += fu.scatter(options.objects or 0, path, (-2.0, -1.8, 0.6), (2.0, 1.8, 2.2), 0.35, rng)
-    return World(tuple(shapes), Light((((1.5, 0.0, 2.1), 0.6), ((-1.5, 0.0, 2.1), 0.6)), ambient=(0.5, 0.5, 0.52)))
+    return shapes
 
 
-def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
-    f = options.texture_frequency
-    partition = fu.matt(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
-    shapes: list[Shape] = [
-        Room((-5.0, -2.5, 0.0), (5.0, 2.5, 2.8), _room_materials(options, 10, 5, rugs=((-2.6, 0.0), (2.6, 0.0)))),
-        *doorway(0, partition),
-        *fu.bookshelf(-2.4, 2.3, 1.8, 2.1),
-        *fu.table(-3.9, -1.6, 1.2, 0.8, 0.75),
-        *fu.crates(-0.6, -2.0, rng),
-        *fu.plant(-4.5, 1.9, 1.5, rng),
-        *fu.pendant(-2.6, 0.0, 2.8, 0.45),
-        *fu.sofa(2.6, 1.95),
-        *fu.floor_lamp(4.5, 1.6),
-        *fu.table(1.0, -2.0, 0.8, 0.6, 0.6),
-        *fu.plant(4.4, -1.9, 1.6, rng),
-        *fu.pendant(2.6, 0.0, 2.8, 0.45),
-        Rod((0.1, -0.95, 2.3), (5, -0.95, 2.3), 0.012, fu.metal()),
-        Rod((-1.2, 1.6, 0), (-1.2, 1.6, 2.8), 0.015, fu.metal()),
-    ]
-    shapes += fu.scatter(options.objects or 0, path, (-4.3, -1.9, 0.5), (4.3, 1.7, 2.2), 0.35, rng)
-    return World(tuple(shapes), Light((((-2.6, 0.0, 2.35), 0.7), ((2.6, 0.0, 2.35), 0.7))))
-
-
-def checker_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build a room with white and dark tiles everywhere, `texture_frequency` per metre, and by default no objects."""
-    skin = Material(tx.checker(WHITE, (0.25, 0.3, 0.35), 1 / options.texture_frequency, mottle=0.0))
-    return _lit_room((skin,) * 6, 2.5, options, path, rng)
-
-
-def white_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build a room with white walls, floor and ceiling, and by default no objects."""
-    return _lit_room((Material(tx.plain(WHITE)),) * 6, 2.5, options, path, rng)
-
-
-def _lit_room(
-    skins: tuple[Material, ...], high: float, options: SyntheticOptions, path: Array, rng: np.random.Generator
-) -> World:
-    """Build a room with one lamp and loose objects up to a height."""
-    objects = fu.scatter(options.objects or 0, path, (-2.0, -1.8, 0.3), (2.0, 1.5, high), 0.35, rng)
-    return World((Room(_LOW, _HIGH, skins), *objects), Light((((0.0, 0.0, 2.5), 0.9),)))
-
-
-ROOM_LENGTH, WIDTH, HEIGHT = 5.0, 5.0, 2.8  # metres, of a room
-ROOMS = 2  # default
-ASIDE = 0.9  # metres between the cameras' path and the line of the doors, in the middle of a room
-WALLPAPERS: tuple[tuple[tx.Color, tx.Color], ...] = (  # colours of the wallpapers, one pair per room
-    ((0.55, 0.62, 0.52), (0.86, 0.83, 0.68)),
-    ((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)),
-    ((0.42, 0.5, 0.62), (0.84, 0.86, 0.9)),
-    ((0.6, 0.42, 0.5), (0.93, 0.82, 0.8)),
-    ((0.58, 0.56, 0.36), (0.92, 0.9, 0.72)),
-)
-
-
-def _room_centers(rooms: int) -> list[float]:
-    """Return the x coordinates of the rooms' centres; the chain is centred at 0."""
-    return [ROOM_LENGTH * (k - (rooms - 1) / 2) for k in range(rooms)]
-
-
-def room_chain_walk(options: SyntheticOptions) -> Walk:
-    """Return a path from end to end and back, on the other side of each room."""
-    rooms = options.rooms or ROOMS
-    centers = _room_centers(rooms)
-    doors = [x + ROOM_LENGTH / 2 for x in centers[:-1]]
+def walk(options: SyntheticOptions) -> Walk:
+    """Return the free space of a scene's cameras; in a chain of rooms, a route from end to end and back."""
+    if options.scene != "room_chain":
+        return Walk(**descriptions()["scenes"][options.scene]["walk"])
+    centers = _room_centers(options)
     there = [(centers[0] - 1.2, 0.0), (centers[0], ASIDE)]
-    for door, x in zip(doors, centers[1:], strict=True):
-        there += [(door, 0.0), (x, ASIDE)]
-    back = [(centers[-1] + 1.2, 0.0), *((x, -y) for x, y in reversed(there[1:]))]
-    center = 0.0 if rooms % 2 else ROOM_LENGTH / 2  # of a cross path: within a room, not in a wall
-    return Walk((center, 0.0), (ROOM_LENGTH * rooms / 2 - center - 1.2, ASIDE), waypoints=(*there, *back))
+    for x in centers[1:]:
+        there += [(x - ROOM_LENGTH / 2, 0.0), (x, ASIDE)]
+    back = [(centers[-1] + 1.2, 0.0), *((x, -y) for x, y in reversed(there[1:]))]  # on the other side of each room
+    center = 0.0 if len(centers) % 2 else ROOM_LENGTH / 2  # of a cross path: within a room, not in a wall
+    return Walk((center, 0.0), (ROOM_LENGTH * len(centers) / 2 - center - 1.2, ASIDE), waypoints=(*there, *back))
+
+
+def _room_centers(options: SyntheticOptions) -> list[float]:
+    """Return the x coordinates of the rooms' centres; the chain is centred at 0."""
+    rooms = options.rooms or ROOMS
+    return [ROOM_LENGTH * (k - (rooms - 1) / 2) for k in range(rooms)]
 
 
 def room_chain(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
     """Build furnished rooms of 5 x 5 m; a view sees about 1 / rooms of all surfaces."""
-    rooms = options.rooms or ROOMS
-    f, centers = options.texture_frequency, _room_centers(rooms)
-    floor = tx.disc(scaled(tx.planks(*fu.OAK), f), _rug(f), 1.7, [(x, 0.0) for x in centers])
-    ceiling = scaled(tx.checker((0.84, 0.82, 0.77), (0.8, 0.78, 0.73), 0.6), f)
-    ends = scaled(tx.bricks((0.45, 0.2, 0.14), (0.78, 0.45, 0.33), (0.78, 0.74, 0.68)), f)
-    half = ROOM_LENGTH * rooms / 2
-    skins = (ends, ends, ends, ends, floor, ceiling)
-    shapes: list[Shape] = [
-        Room((-half, -WIDTH / 2, 0.0), (half, WIDTH / 2, HEIGHT), tuple(Material(skin) for skin in skins))
-    ]
+    centers, build, described = _room_centers(options), Builder(options, rng), descriptions()["chain"]
+    floor = tx.disc(build("boards"), build("rug"), 1.7, [(x, 0.0) for x in centers])
+    skins = tuple(map(Material, (*[build("brick")] * 4, floor, build("squares"))))
+    half = ROOM_LENGTH * len(centers) / 2
+    shapes: list[Shape] = [Room((-half, -WIDTH / 2, 0.0), (half, WIDTH / 2, HEIGHT), skins)]
     for k, x in enumerate(centers):
-        paper = fu.matt(scaled(tx.wallpaper(*WALLPAPERS[k % len(WALLPAPERS)]), f))
+        paper = fu.matt(build(["detailed", described["papers"][k % 5]]))
         shapes += [
             Box((x, side * WIDTH / 2, HEIGHT / 2), (ROOM_LENGTH / 2, 0.01, HEIGHT / 2), paper) for side in (-1, 1)
         ]
-        shapes += _chain_furniture(k, x, rng)
+        furniture = described["furniture"][k % 3]
+        shapes += Builder(options, rng, x).shapes([["pendant", 0.0, 0.0, HEIGHT, 0.45], *furniture])
         if k:
-            shapes += doorway(x - ROOM_LENGTH / 2, paper)
+            shapes += _doorway(x - ROOM_LENGTH / 2, paper)
     low, high = (-half + 0.7, -1.9, 0.5), (half - 0.7, 1.7, 2.2)
-    shapes += fu.scatter((options.objects or 0) * rooms, path, low, high, 0.35, rng)
+    shapes += fu.scatter((options.objects or 0) * len(centers), path, low, high, CLEARANCE, rng)
     return World(tuple(shapes), Light(tuple(((x, 0.0, 2.35), 0.7) for x in centers)))
 
 
-def doorway(x: float, paper: tuple[Material, ...]) -> list[Shape]:
+def _doorway(x: float, paper: tuple[Material, ...]) -> list[Shape]:
     """Return a wall at `x` with a framed opening in its middle."""
     frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))
     return [
@@ -259,28 +164,78 @@ def doorway(x: float, paper: tuple[Material, ...]) -> list[Shape]:
     ]
 
 
-def _chain_furniture(k: int, x: float, rng: np.random.Generator) -> list[Shape]:
-    """Return the furniture of room `k`, centred at `x`."""
-    lamp = fu.pendant(x, 0.0, HEIGHT, 0.45)
-    if k % 3 == 0:
-        return [*lamp, *fu.bookshelf(x - 0.6, 2.3, 1.6, 2.1), *fu.table(x + 0.9, -1.9, 1.2, 0.7, 0.75)]
-    if k % 3 == 1:
-        return [*lamp, *fu.sofa(x + 0.3, 1.95), *fu.floor_lamp(x + 1.9, 1.7), *fu.plant(x - 1.9, -1.9, 1.5, rng)]
-    return [*lamp, *fu.crates(x - 1.5, -2.0, rng), *fu.plant(x + 1.8, 1.9, 1.6, rng), *fu.table(x, 2.0, 1.2, 0.6, 0.6)]
+def sky(direction: Array) -> Array:
+    """Return the colours [3, n] of a blue gradient with clouds on a flat layer overhead."""
+    up = np.maximum(direction[2], 0)
+    color = tx.mix((0.86, 0.9, 0.94), (0.3, 0.52, 0.85), np.sqrt(up))
+    reach = 1 / (up + 0.12)
+    cloud = tx.noise(direction[0] * reach, direction[1] * reach, 5.0)
+    return tx.mix(color, (0.98, 0.98, 0.97), np.clip(2.6 * cloud - 1.15, 0, 1) * np.clip(6 * up, 0, 1)).astype(
+        np.float32
+    )
 
 
-_DOOR_ROUTE = ((0.0, 0.05), (-1.3, 0.3), (-2.4, 1.1), (-3.7, 0.7), (-3.6, -0.6), (-2.2, -1.0), (-1.2, -0.3),
-               (0.0, -0.05), (1.3, -0.4), (2.4, -1.1), (3.6, -0.8), (3.7, 0.6), (2.4, 1.0), (1.2, 0.35))  # fmt: skip
+def _meadow(build: Builder) -> Texture:
+    """Return grass around a paved circle."""
+    blade = build(["by_detail", 0.9])
 
-BLUEPRINTS: dict[str, Blueprint] = {
-    "room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 6, room),
-    "two_rooms": Blueprint(Walk((0.0, 0.0), (3.8, 1.1), waypoints=_DOOR_ROUTE), "roaming", 8, two_rooms),
-    "outdoor": Blueprint(Walk((0.0, 0.0), (4.0, 3.0), height=1.7), "roaming", 12, outdoor),
-    "pole_torture": Blueprint(Walk((0.0, 0.0), (0.9, 0.7), height=1.4), "cross", 4, pole_torture),
-    "bare_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 3, bare_room),
-    "near_clutter": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "line", 40, near_clutter),
-    "glossy": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 8, partial(room, gloss=0.12, reflectance=0.3)),
-    "white_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, white_room),
-    "checker_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, checker_room),
-    "room_chain": Blueprint(room_chain_walk, "roaming", 4, room_chain),
-}
+    def grass(uv: Array) -> Array:
+        far, near = tx.noise(uv[0], uv[1], 37.0), tx.noise(uv[0], uv[1], blade)
+        color = tx.mix((0.2, 0.36, 0.12), (0.52, 0.56, 0.25), 0.6 * far + 0.5 * near)
+        furrow = 0.5 + 0.5 * np.sin(uv[0] * 0.35 + 6 * far)
+        return tx.mix(color, (0.45, 0.36, 0.22), 0.25 * furrow)
+
+    return tx.disc(grass, build(["disc", "paving", "compass", 2.2]), 7.5)
+
+
+def _mountains(uv: Array) -> Array:
+    """Draw the mountains for a distance of 300 m."""
+    rock = tx.noise(uv[0], uv[1] * 2, 260.0)
+    height = uv[1] / 45 + 0.35 * (rock - 0.5)
+    color = tx.mix((0.32, 0.42, 0.38), (0.5, 0.54, 0.62), tx.step(0.45, height, 0.3))
+    color = tx.mix(color, (0.93, 0.94, 0.97), tx.step(0.85, height, 0.12))
+    return tx.mix(color, (0.75, 0.81, 0.88), 0.35) * (0.75 + 0.5 * rock)
+
+
+def _facade(wall: Texture, width: float, height: float) -> Texture:
+    glass = tx.window((0.3, 0.4, 0.52), (0.9, 0.88, 0.84), 2)
+    patches = [
+        (float(u), float(v), 0.9, 1.2, glass)
+        for u in np.arange(-width / 2 + 1.2, width / 2 - 0.9, 2.1)
+        for v in np.arange(-height / 2 + 1.6, height / 2 - 0.8, 2.4)
+    ]
+    return tx.framed(wall, patches)
+
+
+def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """Build the scene; loose objects are at least 0.3 m from the path and at most 6 m from the centre."""
+    build = Builder(options, rng)
+    walls = [build(f"house_{k}") for k in range(4)]
+    roof = Material(build("roof"))
+    horizon = 300.0 if options.horizon is None else options.horizon
+    magnification = horizon / 300
+    shapes: list[Shape] = [
+        Ground((Material(_meadow(build)),)),
+        Ring(horizon, 60 * magnification, (Material(scaled(_mountains, 1 / magnification), glows=True),)),
+    ]
+    for k in range(14):
+        far = 11 + 5.5 * k * rng.uniform(0.8, 1.2)
+        angle = 2.4 * k + rng.uniform(-0.3, 0.3)
+        half = rng.uniform((2.5, 2.5, 2.5), (4.5, 4.0, 6.0))
+        x, y, yaw = far * math.cos(angle), far * math.sin(angle), float(rng.uniform(-0.5, 0.5))
+        if far > 0.8 * horizon:  # in the mountains or behind them
+            continue
+        side = [Material(_facade(walls[k % 4], 2 * half[axis], 2 * half[2])) for axis in (1, 1, 0, 0)]
+        shapes.append(Box((x, y, half[2]), fu.point(half), (*side, roof, roof), yaw))
+        shapes.append(Box((x, y, 2 * half[2] + 0.15), (half[0] + 0.3, half[1] + 0.3, 0.15), (roof,), yaw))
+    for k in range(8):
+        angle = math.pi / 4 * k + 0.2
+        x, y = 6.5 * math.cos(angle), 6.5 * math.sin(angle)
+        shapes.append(Rod((x, y, 0), (x, y, 4.5), 0.04, fu.metal((0.3, 0.33, 0.35))))
+        shapes += fu.floor_lamp(0.7 * x, 0.7 * y, 1.1) if k % 2 else fu.plant(0.8 * x, 0.8 * y, 1.6, rng)
+        next_angle = angle + math.pi / 4
+        end = (6.5 * math.cos(next_angle), 6.5 * math.sin(next_angle), 4.4)
+        shapes.append(Rod((x, y, 4.4), end, 0.015, fu.metal((0.2, 0.2, 0.2))))
+    shapes += fu.scatter(options.objects or 0, path, (-5.0, -4.0, 0.3), (5.0, 4.0, 1.6), 0.3, rng)
+    sun = ((260.0, 180.0, 330.0), 90.0)  # nearly parallel light
+    return World(tuple(shapes), Light((sun,), ambient=(0.45, 0.5, 0.58), size=4.0), sky)

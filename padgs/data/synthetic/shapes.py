@@ -53,6 +53,7 @@ def _rotated(vectors: Array, yaw: float) -> Array:
 
 
 _FACE_AXES = np.array(((1, 1, 0, 0, 0, 0), (2, 2, 2, 2, 1, 1)))  # coordinates of u and v
+_FACE_NORMALS = np.array(((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)))
 _FACE_SIGNS = np.array((-1, 1, 1, -1, 1, 1))  # of u, seen from outside
 
 
@@ -66,10 +67,7 @@ def _face_uv(local: Array, face: Array, side: float) -> Array:
 
 
 def _face_normal(face: Array, dtype: np.dtype) -> Array:
-    normals = np.zeros((6, 3), dtype)
-    for index in range(6):
-        normals[index, index // 2] = 1 if index % 2 else -1
-    return normals[face].T
+    return _FACE_NORMALS.astype(dtype)[face].T
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from padgs.data.capture import DataError
-from padgs.data.synthetic import camera, paths
+from padgs.data.synthetic import camera, paths, scenes
 from padgs.data.synthetic.options import SyntheticOptions
-from padgs.data.synthetic.scenes import BLUEPRINTS
 from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.world import World
 from padgs.scene import View
@@ -24,18 +23,16 @@ class SyntheticTruth:
     """World of a synthetic scene. Lengths in and out are world units."""
 
     def __init__(self, options: SyntheticOptions) -> None:
-        blueprint = BLUEPRINTS[options.scene]
+        description = scenes.descriptions()["scenes"][options.scene]
         if options.objects is None:
-            options = replace(options, objects=blueprint.objects)
+            options = replace(options, objects=description["objects"])
         self.options = options
-        radius, walk = options.path_radius, blueprint.walk
-        if not isinstance(walk, paths.Walk):
-            walk = walk(options)
+        radius, walk = options.path_radius, scenes.walk(options)
         if radius is not None:
             walk = replace(walk, half=(radius, radius), waypoints=())
-        path = paths.curve(walk, options.path or blueprint.path, self.random("path"))
+        path = paths.curve(walk, options.path or description["path"], self.random("path"))
         self.poses = paths.poses(options, path, self.random("poses"))  # [n, 4, 4] metres, exact
-        self.world: World = blueprint.furnish(options, path, self.random("furniture"))
+        self.world: World = scenes.world(options, path, self.random("furniture"))
 
     def random(self, stream: str) -> np.random.Generator:
         """Return the generator of one purpose, so that options do not change unrelated random numbers."""

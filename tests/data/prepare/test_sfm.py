@@ -1,9 +1,13 @@
 """Pairs to match, and level worlds."""
 
+from pathlib import Path
+
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from padgs.data.prepare.pipeline import rotation_between
+from padgs.data.capture import Cloud, Frame
+from padgs.data.prepare.pipeline import level_world
 from padgs.data.prepare.sfm import EXHAUSTIVE_UP_TO, image_pairs
 
 NAMES = [f"{index:04d}" for index in range(500)]
@@ -34,11 +38,14 @@ def test_names_are_sorted_naturally():
     assert ("pano9.jpg", "pano10.jpg") in pairs and ("pano10.jpg", "pano100.jpg") not in pairs
 
 
-def test_rotation_between_is_the_smallest_rotation_to_z():
+def test_worlds_are_levelled_by_the_smallest_rotation():
+    cloud = Cloud(torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.uint8))
     for vector in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8), (-0.48, 0.64, -0.6)):
-        up = torch.tensor(vector, dtype=torch.float64)
-        rotation = rotation_between(up)
-        torch.testing.assert_close(rotation @ up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        pose = torch.eye(4, dtype=torch.float64)
+        turn = Rotation.align_vectors([vector], [(0.0, -1.0, 0.0)])[0]
+        pose[:3, :3] = torch.from_numpy(turn.as_matrix()).mT
+        (frame,), levelled, _ = level_world((Frame("a", Path("a"), pose),), cloud)
+        rotation = levelled.points.mT  # of the axes
+        torch.testing.assert_close(-frame.cam_from_world[1, :3], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
-        assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
         assert (rotation.trace().item() - 1) / 2 == pytest.approx(vector[2], abs=1e-9)  # cosine of its angle

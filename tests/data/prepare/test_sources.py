@@ -11,7 +11,7 @@ from PIL import Image
 
 from padgs.data import DataError
 from padgs.data.assemble import PREPARED, SKIPPED
-from padgs.data.prepare.sources import _panorama_of, extract_frames, find_source, is_video, sharpness
+from padgs.data.prepare.sources import _pixels, extract_frames, find_source, is_video, sharpness
 from padgs.results import CONFIG_NAME, PICTURES
 
 
@@ -127,17 +127,13 @@ def test_a_missing_extra_is_reported(tmp_path, monkeypatch):
         extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
 
 
-def write(path, frames, times=None, turned=0, stereo=None):
+def write(path, frames, times=None):
     """Write a video of ten frames a second, or of frames at `times` in tenths of a second."""
     av = pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height = frames[0].shape[1], frames[0].shape[0]
         stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
-        if turned:
-            stream.set_display_rotation(turned)
-        if stereo:
-            stream.metadata["stereo_mode"] = stereo
         for index, pixels in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
             frame.pts = index if times is None else times[index]
@@ -167,80 +163,27 @@ def test_frames_are_chosen_by_time_at_a_variable_rate(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "store", "stated"),
-    [
-        ("a.mp4", lambda pixels: np.rot90(pixels, 2), {"turned": 180}),
-        ("a.mp4", lambda pixels: np.rot90(pixels, -1), {"turned": 90}),
-        ("a.mp4", lambda pixels: np.rot90(pixels, 1), {"turned": -90}),
-        ("a.mkv", lambda pixels: np.concatenate((pixels, 255 - pixels), 0), {"stereo": "top_bottom"}),
-        ("a.mkv", lambda pixels: np.concatenate((pixels, 255 - pixels), 1), {"stereo": "left_right"}),
-    ],
-    ids=["upside down", "turned left", "turned right", "top and bottom", "left and right"],
-)
-def test_frames_are_turned_and_cut_as_the_video_says(name, store, stated, tmp_path):
-    pixels = np.full((64, 128, 3), 200, np.uint8)
-    pixels[32:], pixels[:, :64, 0] = 60, 255
-    write(tmp_path / name, 3 * [store(pixels)], **stated)
-    extract_frames(tmp_path / name, tmp_path, 2.0)
-    assert np.abs(np.asarray(Image.open(tmp_path / "frame_00001.jpg")).astype(int) - pixels).mean() < 2
-
-
-def add_spherical_xml(path, **properties):
-    """Add the metadata of Spherical Video V1 to the track of an MP4 file whose index is at its end."""
-    content = "".join(f"<GSpherical:{name}>{value}</GSpherical:{name}>" for name, value in properties.items())
-    xml = f'<?xml version="1.0"?><rdf:SphericalVideo>{content}</rdf:SphericalVideo>'.encode()
-    data = path.read_bytes()
-    moov, trak = data.index(b"moov") - 4, data.index(b"trak") - 4
-    box = (len(xml) + 24).to_bytes(4, "big") + b"uuid" + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + xml
-    end = trak + int.from_bytes(data[trak : trak + 4], "big")
-    data = data[:end] + box + data[end:]
-    for place in (moov, trak):
-        size = int.from_bytes(data[place : place + 4], "big") + len(box)
-        data = data[:place] + size.to_bytes(4, "big") + data[place + 4 :]
-    path.write_bytes(data)
-
-
-def test_the_xml_of_an_mp4_file_is_read(tmp_path):
-    path, pixels = tmp_path / "a.mp4", np.full((64, 128, 3), 90, np.uint8)
-    for mode, stored in (("top-bottom", np.tile(pixels, (2, 1, 1))), ("left-right", np.tile(pixels, (1, 2, 1)))):
-        write(path, 3 * [stored])
-        add_spherical_xml(path, ProjectionType="equirectangular", StereoMode=mode)
-        extract_frames(path, tmp_path, 2.0)
-        assert np.asarray(Image.open(tmp_path / "frame_00001.jpg")).shape == (64, 128, 3)
-    refused = (
-        ({"ProjectionType": "cubemap"}, "its projection is cubemap"),
-        ({"StereoMode": "stereo-custom"}, "stereo of a kind that is not read"),
-        ({"FullPanoWidthPixels": 256, "CroppedAreaImageWidthPixels": 128}, "128 of 256 pixels of its panoramas"),
-    )
-    for properties, message in refused:
-        write(path, 3 * [pixels])
-        add_spherical_xml(path, **properties)
-        with pytest.raises(DataError, match=message):
-            extract_frames(path, tmp_path, 2.0)
-
-
-class Side(bytes):
-    type = SimpleNamespace(name="")
-
-
-@pytest.mark.parametrize(
     ("name", "numbers", "message"),
     [
-        ("SPHERICAL", [1], "its projection is cubemap, not equirectangular"),
-        ("STEREO3D", [6], "stereo of a kind that is not read"),
-        ("DISPLAYMATRIX", [65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30], "mirrored or turned by 0 degrees"),
-        ("DISPLAYMATRIX", [46341, -46341, 0, 46341, 46341, 0, 0, 0, 1 << 30], "turned by 45 degrees"),
+        ("SPHERICAL", [1], "in another projection than equirectangular"),
+        ("STEREO3D", [2], "stereo: export one eye"),
+        ("DISPLAYMATRIX", [65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30], "turned or mirrored"),
+        ("DISPLAYMATRIX", [0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30], "turned or mirrored"),
     ],
 )
-def test_other_statements_of_videos_are_refused(name, numbers, message):
-    side = Side(np.array(numbers, np.int32).tobytes())
-    side.type = SimpleNamespace(name=name)
-    pixels = np.zeros((8, 16, 3), np.uint8)
-    frame = SimpleNamespace(color_trc=1, side_data=[side], to_ndarray=lambda format: pixels)
-    with pytest.raises(DataError, match=message):
-        _panorama_of(frame, Path("a.mp4"))
+def test_videos_that_are_not_upright_panoramas_of_one_eye_are_refused(name, numbers, message):
+    class Side(bytes):
+        type = SimpleNamespace(name=name)
+
+    def frame(*numbers, transfer=1):
+        side_data = [Side(np.array(numbers, np.int32).tobytes())]
+        return SimpleNamespace(color_trc=transfer, side_data=side_data, to_ndarray=lambda format: "pixels")
+
+    with pytest.raises(DataError, match=f"a.mp4 says that it is {message}"):
+        _pixels(frame(*numbers), Path("a.mp4"))
+    assert _pixels(frame(*((65536, 0, 0, 0, 65536) if len(numbers) > 1 else (0,))), Path("a.mp4")) == "pixels"
     with pytest.raises(DataError, match=r"a.mp4 is HDR \(transfer PQ\)"):
-        _panorama_of(SimpleNamespace(color_trc=16), Path("a.mp4"))
+        _pixels(frame(0, transfer=16), Path("a.mp4"))
 
 
 def test_other_aspect_ratios_are_refused_at_the_first_frame(tmp_path):

@@ -22,16 +22,6 @@ def test_threads_are_limited_by_free_memory(monkeypatch):
     assert work.threads_for(2048, 1024) == 1
 
 
-def test_free_memory_without_proc(monkeypatch):
-    def absent(*args, **kwargs):
-        raise FileNotFoundError
-
-    monkeypatch.setattr("builtins.open", absent)
-    assert work.free_memory() == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    monkeypatch.delattr(os, "sysconf")
-    assert work.free_memory() is None
-
-
 def test_files_are_copied_on_file_systems_without_links(tmp_path, monkeypatch):
     original = tmp_path / "original.png"
     original.write_bytes(b"a picture")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, camera
-from padgs.data.synthetic.points import sample_points
+from padgs.data.synthetic.camera import sample_points
 
 
 def cloud(**settings):

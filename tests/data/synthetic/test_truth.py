@@ -30,7 +30,7 @@ def test_world_scale_changes_no_pixel():
     assert other.scale == pytest.approx(100 * scene.scale, rel=1e-5)
 
 
-@pytest.mark.parametrize("scene", ["bare_room", "two_rooms"])  # the second has a route of its own
+@pytest.mark.parametrize("scene", ["bare_room", "room_chain"])  # the second has a route of its own
 def test_paths_have_the_given_radius(scene):
     poses = SyntheticTruth(
         SyntheticOptions(**SMALL | {"scene": scene, "path": "cross", "path_radius": 0.5, "train_views": 40})
