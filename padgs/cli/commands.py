@@ -12,7 +12,6 @@ from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.errors import without_traceback
 from padgs.cli.export import export
-from padgs.cli.mask import mask
 from padgs.cli.prepare import prepare
 from padgs.cli.render import render
 from padgs.cli.report import report
@@ -39,5 +38,5 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, mask, prepare, render, report, smallest, track, view):
+for command in (bench, check, convert, export, prepare, render, report, smallest, track, view):
     app.command()(without_traceback(command))

@@ -22,7 +22,6 @@ from padgs.geometry.distortion import solid_angle_weight
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
 MASK_FOLDERS = ("masks", "mask")
-PREVIEW = "mask_preview.jpg"  # written beside them by `padgs.data.prepare.nadir`
 MIN_VISIBLE = 0.01  # of the sphere; with less, training has no signal and metrics are undefined
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
 

@@ -42,7 +42,6 @@ def test_whole_numbers_out_of_range_are_refused(option, tmp_path, monkeypatch):
     ("option", "rule"),
     [
         ("prepare SOURCE OUT --per-second", "it must be from 0.001 to 1000"),
-        ("mask SOURCE --below", "give more than 0, up to 89"),
         ("smallest RUN --epsilon", "it must be one of 0.05, 0.1"),
     ],
 )

@@ -26,7 +26,7 @@ from padgs.data.images import (
     refuse_dual_fisheye,
     refuse_other_shapes,
 )
-from padgs.data.masks import MASK_FOLDERS, PREVIEW, SCENE_MASKS, Mask, find_masks
+from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
@@ -204,8 +204,8 @@ def find_source(path: Path, mask: str) -> Source:
 
 
 def panoramas(folder: Path) -> list[str]:
-    """Return the panoramas below a folder, relative to it and sorted, without masks and previews."""
-    others = (*SCENE_MASKS, PREVIEW, OVERLAY)
+    """Return the panoramas below a folder, relative to it and sorted, without masks."""
+    others = (*SCENE_MASKS, OVERLAY)
     names = [name for name in image_names(folder) if PurePosixPath(name).parts[0] not in MASK_FOLDERS]
     return [name for name in names if PurePosixPath(name).name not in others]
 

@@ -8,19 +8,25 @@ one unit per metre unless `world_scale` changes that.
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache, partial
+import json
+import os
+import shutil
+from dataclasses import asdict, dataclass
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from padgs.checks import ConfigError, typed
 from padgs.data.capture import DataError, DataOptions
 from padgs.data.store import ImageStore, StoredImage
-from padgs.data.synthetic import cache, camera, paths
-from padgs.data.synthetic.camera import draw_stitched, sample_points
+from padgs.data.synthetic import camera, paths
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
+from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.truth import SyntheticTruth
+from padgs.files import draft_of
 from padgs.scene import Scene, View
 
 __all__ = ["SCENES", "SyntheticOptions", "SyntheticTruth", "generate", "load"]
@@ -49,12 +55,12 @@ def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scen
 
     Takes 15-20 s of processor time for 30 views at 512 x 256, on all processors. `store` caches decoded images.
     """
-    stored, notes = cache.read(options), []
+    stored, notes = read_cache(options), []
     if stored is None:
         stored = _make(options)
-        problem = cache.write(options, stored)
+        problem = write_cache(options, stored)
         notes = [problem] if problem else []
-        stored = cache.read(options) or stored
+        stored = read_cache(options) or stored
     store = store or ImageStore()
     held_out = set(paths.held_out(options))
     train, test = [], []
@@ -90,7 +96,7 @@ def _truth(options: SyntheticOptions) -> SyntheticTruth:
     return SyntheticTruth(options)
 
 
-def _make(options: SyntheticOptions) -> cache.Stored:
+def _make(options: SyntheticOptions) -> Stored:
     truth = SyntheticTruth(options)
     held_out = set(paths.held_out(options))
     images = []
@@ -99,13 +105,84 @@ def _make(options: SyntheticOptions) -> cache.Stored:
             images.append(camera.draw(truth.world, pose, options.width, options.samples, options.seed))
         else:
             gap = options.lens_gap * truth.median_depth
-            images.append(draw_stitched(truth.world, pose, gap, options))
+            images.append(camera.draw_stitched(truth.world, pose, gap, options))
     train = [index for index in range(len(images)) if index not in held_out]
-    points, colors = sample_points(
+    points, colors = camera.sample_points(
         truth.world, truth.poses[train], [images[index] for index in train], options, truth.random("points")
     )
     points, poses = options.world_scale * points, truth.given_poses
     digest = hashlib.sha256(repr(sorted(held_out)).encode())
     for array in (*images, poses, points, colors):
         digest.update(np.ascontiguousarray(array).tobytes())
-    return cache.Stored(images, poses, points, colors, digest.hexdigest())
+    return Stored(images, poses, points, colors, digest.hexdigest())
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Generated data of a Scene, in world units."""
+
+    images: list[Array] | list[Path]  # of all views along the path: [H, W, 3] uint8, or PNG files
+    poses: Array  # [n, 4, 4] cam_from_world with pose noise
+    points: Array  # [P, 3]
+    colors: Array  # [P, 3] uint8
+    fingerprint: str
+
+
+def cache_folder(options: SyntheticOptions) -> Path:
+    """Return the cache folder of a scene, named by a hash of its options and of the code that generates scenes.
+
+    It is in $PADGS_CACHE, or ~/.cache/padgs, and holds PNGs, `scene.npz` and the digest of both. A scene that does not
+    fit its digest is generated again. Without write access there is no cache.
+    """
+    named = os.environ.get("PADGS_CACHE")
+    digest = hashlib.sha256(json.dumps(asdict(options), sort_keys=True).encode())
+    digest.update(_source())
+    return (Path(named) if named else Path.home() / ".cache" / "padgs") / "synthetic" / digest.hexdigest()[:24]
+
+
+@cache
+def _source() -> bytes:
+    return b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.iterdir()) if path.is_file())
+
+
+def _digest(entry: Path) -> str:
+    digest = hashlib.sha256()
+    for file in sorted(entry.glob("*.*")):
+        digest.update(f"{file.name}|".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def read_cache(options: SyntheticOptions) -> Stored | None:
+    """Read a cached scene; None if it is missing or was changed."""
+    entry = cache_folder(options)
+    try:
+        if (entry / "sha256").read_text() != _digest(entry):
+            return None
+        with np.load(entry / "scene.npz", allow_pickle=False) as table:
+            images, fingerprint = sorted(entry.glob("*.png")), str(table["fingerprint"])
+            return Stored(images, table["poses"], table["points"], table["colors"], fingerprint)
+    except (OSError, ValueError):
+        return None
+
+
+def write_cache(options: SyntheticOptions, stored: Stored) -> str | None:
+    """Cache a scene; returns the reason if that is impossible."""
+    entry = cache_folder(options)
+    try:
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        with draft_of(entry) as draft:
+            draft.mkdir()
+            for index, image in enumerate(stored.images):
+                assert isinstance(image, np.ndarray)
+                Image.fromarray(image).save(draft / f"{index:06d}.png", compress_level=2)
+            arrays = {name: getattr(stored, name) for name in ("poses", "points", "colors", "fingerprint")}
+            np.savez_compressed(draft / "scene.npz", **arrays)
+            (draft / "sha256").write_text(_digest(draft))
+            if entry.exists() and read_cache(options) is None:
+                shutil.rmtree(entry)  # changed or damaged
+            draft.rename(entry)
+    except OSError as error:
+        if read_cache(options) is not None:
+            return None  # another process was faster
+        return f"generated scene not cached: {error}; set PADGS_CACHE to a folder that can be written"
+    return None

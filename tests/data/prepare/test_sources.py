@@ -39,13 +39,12 @@ def test_images_masks_and_notes(tmp_path):
     assert find_source(tmp_path, "rows:3/4").masks["b.png"]().mean() == pytest.approx(0.75)
 
 
-def test_masks_previews_and_renders_are_not_panoramas(tmp_path):
+def test_masks_overlays_and_renders_are_not_panoramas(tmp_path):
     save(tmp_path / "a.png")
     save(tmp_path / "b.png")
     save(tmp_path / "masks" / "a.png", 255)
     for place in (".", "kitchen", "flat/images", "runs/flat/renders"):
         save(tmp_path / place / "check.png")
-        save(tmp_path / place / "mask_preview.jpg")
     (tmp_path / "flat" / PREPARED).touch()
     assert SKIPPED[1] == (CONFIG_NAME, PICTURES)
     (tmp_path / "runs" / "flat" / CONFIG_NAME).touch()

@@ -8,7 +8,16 @@ import torch
 from PIL import Image
 
 from padgs.data import DataError, DataOptions
-from padgs.data.synthetic import SCENES, SyntheticOptions, SyntheticTruth, cache, camera, generate, load
+from padgs.data.synthetic import (
+    SCENES,
+    SyntheticOptions,
+    SyntheticTruth,
+    cache_folder,
+    camera,
+    generate,
+    load,
+    read_cache,
+)
 from padgs.data.synthetic.paths import curve
 from padgs.data.synthetic.scenes import descriptions, walk
 
@@ -62,7 +71,7 @@ def test_a_damaged_cache_is_regenerated(tmp_path):
     same(first, generate(options))
     next(tmp_path.rglob("000003.png")).unlink()
     same(first, generate(options))
-    assert cache.read(options) is not None
+    assert read_cache(options) is not None
 
 
 def test_a_changed_picture_or_point_in_the_cache_is_not_believed(tmp_path):
@@ -70,7 +79,7 @@ def test_a_changed_picture_or_point_in_the_cache_is_not_believed(tmp_path):
     first = generate(options)
     pixels = first.train[1].load_pixels().numpy()
     Image.fromarray(255 - pixels).save(next(tmp_path.rglob("000002.png")))
-    assert cache.read(options) is None
+    assert read_cache(options) is None
     same(first, generate(options))
     table = next(tmp_path.rglob("scene.npz"))
     arrays = dict(np.load(table)) | {"points": np.zeros((300, 3))}
@@ -93,7 +102,7 @@ def test_scenes_generate_without_a_writable_cache(tmp_path, monkeypatch):
 def test_options_and_seeds_change_the_key_and_the_scene():
     base, points = SyntheticOptions(**TINY), SyntheticOptions(**(TINY | {"points": 301}))
     seed = SyntheticOptions(**TINY, seed=1)
-    assert len({cache.key(options) for options in (base, SyntheticOptions(**TINY), points, seed)}) == 3
+    assert len({cache_folder(options) for options in (base, SyntheticOptions(**TINY), points, seed)}) == 3
     first, second = generate(base), generate(seed)
     assert first.fingerprint != second.fingerprint
     assert not torch.equal(first.train[0].cam_from_world, second.train[0].cam_from_world)
