@@ -9,17 +9,18 @@ import typer
 from padgs.cli.errors import check_range, show
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
+SOURCES = "metashape, e57, navvis, roam360, ricoh360, omniblender"  # besides
 
 
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
     to: Annotated[str, typer.Option(help=f"the format to write: {FORMATS}")],
-    format: Annotated[
-        str, typer.Option(help="format of the source: auto, one of these, roam360, ricoh360 or omniblender")
-    ] = "auto",
+    format: Annotated[str, typer.Option(help=f"format of the source: auto, one of these, or {SOURCES}")] = "auto",
     width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
-    points: Annotated[str, typer.Option(help="auto, random, or a PLY file in the source's folder")] = "auto",
+    points: Annotated[
+        str, typer.Option(help="auto, random, or a PLY, LAS or E57 file in the source's folder")
+    ] = "auto",
     mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:

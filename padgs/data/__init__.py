@@ -11,6 +11,7 @@ from pathlib import Path
 from padgs.checks import lookup
 from padgs.data.assemble import assemble, found_images
 from padgs.data.capture import Capture, DataError, DataOptions
+from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
 from padgs.scene import Scene
@@ -22,6 +23,9 @@ LOADERS = {
     "nerfstudio": "padgs.data.formats.transforms:read",  # an alias of transforms
     "openmvg": "padgs.data.formats.reconstructions:read_openmvg",
     "opensfm": "padgs.data.formats.reconstructions:read_opensfm",
+    "metashape": "padgs.data.formats.metashape:read",
+    "e57": "padgs.data.formats.scanners:read_e57",
+    "navvis": "padgs.data.formats.scanners:read_navvis",
     "roam360": "padgs.data.formats.published:read_roam360",
     "ricoh360": "padgs.data.formats.published:read_ricoh360",
     "omniblender": "padgs.data.formats.published:read_omniblender",
@@ -74,4 +78,4 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         raise DataError(f"{path}: synthetic scenes are made, not read from a folder; give another format, or auto")
     capture: Capture = lookup(LOADERS, format, "data.format")(path, options)
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
-    return found_images(replace(capture, mask=mask, notes=(*notes, *capture.notes)))
+    return best_reading(found_images(replace(capture, mask=mask, notes=(*notes, *capture.notes))))

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -99,6 +99,14 @@ class Tracks:
         return Tracks(self.frame[some], self.point[some], self.pixels[some])
 
 
+class Reading(NamedTuple):
+    """One way to understand what the files of a format leave open."""
+
+    words: str
+    axes: Tensor  # [4, 4]; poses are `axes @ cam_from_world`
+    world: Tensor  # [4, 4]; points are those of the cloud under this affine map
+
+
 @dataclass(frozen=True)
 class Capture:
     """Contents of a data set before its images are read."""
@@ -113,6 +121,7 @@ class Capture:
     width: int | None = None  # wider images are reduced to it if data.width is null; None = as stored
     tracks: Callable[[], Tracks] | None = None
     notes: tuple[str, ...] = ()
+    readings: tuple[Reading, ...] = ()  # the first is the usual one; see `padgs.data.conventions.best_reading`
 
 
 SPLITS = ("auto", "files", "every", "all")
@@ -125,7 +134,7 @@ class DataSettings:
     dataset: str | None = None  # a name of DATASETS, which defines mask, size and source
     width: int | None = None  # panoramas are reduced to this width by an area filter; None = as stored
     images: str | None = None  # image folder, relative to the data set's; None = search
-    points: str = "auto"  # auto | random | a PLY file, relative to the data set's folder
+    points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative to the data set's folder
     mask: str = "auto"  # auto | none | rows:959/1024 (keep the first 959 of 1024) | a file, or a folder of files
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
     test_every: int = 8  # k of split=every

@@ -17,7 +17,10 @@ from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
 from padgs.data.capture import Capture, DataError, DataOptions, listed
 from padgs.data.conventions import (
+    MIN_CORRELATION,
+    MIN_GAIN,
     POINTS,
+    SMALL,
     VIEWS,
     colour_fit,
     exposure_gains,
@@ -31,11 +34,8 @@ from padgs.scene import Scene, View, move_origin
 
 OVERLAY = "check.png"  # default name, beside the data
 MAX_WIDTH = 2048  # of the overlay
-SMALL = 256  # width at which colours are compared
 MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
-MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
 MIN_POINTS = 30  # whose colours are compared
-MIN_CORRELATION = 0.3  # of the colours of points and images that agree
 MAX_HIDDEN = 0.75  # share of an image that a sound mask hides at most: tripod, sky, what a part of a panorama lacks
 LEAK_DISTANCE = 0.01  # of the median depth: a test view nearer to a training view tests memory
 UNEVEN_EXPOSURE = 0.1  # standard deviation of the gains in doublings, from which learning exposures helps

@@ -48,6 +48,19 @@ def read_ply(path: Path) -> Cloud:
     return Cloud(torch.from_numpy(columns("x", "y", "z").astype(np.float64)), colors)
 
 
+def read_cloud(path: Path) -> tuple[Cloud, tuple[str, ...]]:
+    """Read a point cloud by its extension: LAS, LAZ, E57, else PLY; and notes.
+
+    Raises:
+        DataError: missing or damaged, or the package that reads it is not installed.
+    """
+    if path.suffix.lower() in (".las", ".laz", ".e57"):
+        from padgs.data import scans
+
+        return scans.read_e57_points(path) if path.suffix.lower() == ".e57" else scans.read_las(path)
+    return read_ply(path), ()
+
+
 def color_bytes(values: NDArray[Any], where: str) -> Tensor:
     """Scale colours [P, 3] to uint8 by the range of their type: 1 for floats, 255 or 65535 for whole numbers.
 
@@ -125,7 +138,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
 
     Args:
         capture: a data set.
-        source: `data.points`: auto (the format's own, else random), random, or a PLY file.
+        source: `data.points`: auto (the format's own, else random), random, or a file for `read_cloud`.
 
     Raises:
         DataError: there is no point, or one is not finite.
@@ -134,7 +147,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
     cloud, where = capture.cloud, f"the {capture.format} model in {capture.folder}"
     if source not in ("auto", "random"):
         path = capture.folder / source
-        cloud, where = read_ply(path), str(path)
+        (cloud, notes), where = read_cloud(path), str(path)
     elif source == "random" or cloud is None:
         cloud = random_cloud(torch.stack([frame.cam_from_world for frame in capture.frames]))
         why = (

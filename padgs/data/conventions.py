@@ -7,19 +7,27 @@ strongly only if axes, handedness and direction of the poses are right, even if 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import permutations, product
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import Tracks
+from padgs.data.capture import Capture, DataError, Reading, Tracks, listed
+from padgs.data.images import decode
+from padgs.data.store import area_resize
 from padgs.geometry.panorama import project
 
 POINTS = 3000  # sampled for a comparison
 VIEWS = 8
+SMALL = 256  # width at which colours are compared
+MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
+MIN_CORRELATION = 0.3  # of the colours of points and images that agree
 
 
 class Convention(NamedTuple):
@@ -65,6 +73,52 @@ def reprojection_errors(poses: Tensor, points: Tensor, tracks: Tracks, width: in
     along = (difference[:, 0] + width / 2) % width - width / 2
     along = along * torch.cos((tracks.pixels[:, 1] / height - 0.5) * torch.pi)
     return torch.hypot(along, difference[:, 1])
+
+
+def best_reading(capture: Capture) -> Capture:
+    """Decide between the readings of a capture by the colours of points and panoramas; the first, if they cannot tell.
+
+    Notes say what was decided, and why.
+    """
+    readings = [
+        reading
+        for i, reading in enumerate(capture.readings)
+        if not any(reading.axes.equal(one.axes) and reading.world.equal(one.world) for one in capture.readings[:i])
+    ]
+    if not readings or (len(readings) > 1 and capture.cloud is None):
+        return replace(capture, readings=())
+    poses, cloud, best = torch.stack([frame.cam_from_world for frame in capture.frames]), capture.cloud, readings[0]
+    notes = list(capture.notes)
+    if len(readings) > 1 and cloud is not None:
+        step = max(1, len(poses) // VIEWS)
+        fits = [0.0]
+        with suppress(DataError):  # missing and damaged images are reported later
+            images = _small_images([frame.image for frame in capture.frames[::step][:VIEWS]])
+            if cloud.colors is not None:
+                fits = [
+                    colour_fit(one.axes @ poses[::step][:VIEWS], images, _moved(cloud.points, one), cloud.colors)
+                    for one in readings
+                ]
+        if max(fits) > max(MIN_CORRELATION, fits[0] + MIN_GAIN):
+            best = readings[fits.index(max(fits))]
+        why = f"colours agree by {max(fits):.2f}" if max(fits) > MIN_CORRELATION else "not tested by colours"
+        notes.append(f"{best.words} ({why}; otherwise {listed(one.words for one in readings if one is not best)})")
+    frames = (
+        replace(frame, cam_from_world=best.axes @ pose) for frame, pose in zip(capture.frames, poses, strict=True)
+    )
+    cloud = cloud and replace(cloud, points=_moved(cloud.points, best))
+    return replace(capture, frames=tuple(frames), cloud=cloud, notes=tuple(notes), readings=())
+
+
+def _moved(points: Tensor, reading: Reading) -> Tensor:
+    return points.double() @ reading.world[:3, :3].T + reading.world[:3, 3]
+
+
+def _small_images(files: Sequence[Path]) -> Tensor:
+    """Decode panoramas [F, H, W, 3] uint8, reduced to one width of at most `SMALL`."""
+    images = [decode(file) for file in files]
+    width = min(SMALL, *(image.shape[1] for image in images))
+    return torch.stack([torch.from_numpy(area_resize(image, width, width // 2)) for image in images])
 
 
 def known_conventions() -> list[Convention]:

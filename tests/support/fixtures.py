@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -235,6 +235,78 @@ def write_released(world: World, folder: Path) -> None:
     (folder / "data_extrinsics.json").write_text(json.dumps({"extrinsics": extrinsics}))
 
 
+def similarity(seed: int) -> NDArray[np.float64]:
+    """Return a rotation, translation and scale [4, 4] that are not trivial."""
+    source, matrix = np.random.default_rng(seed), np.eye(4)
+    rotation = Rotation.from_quat(source.normal(size=4)).as_matrix()
+    matrix[:3, :3], matrix[:3, 3] = source.uniform(0.2, 5) * rotation, source.normal(size=3) * 3
+    return matrix
+
+
+def write_metashape(world: World, folder: Path, chunk: bool = True, cloud: str = "chunk") -> None:
+    """Write two spherical sensors and components under a chunk, with the cloud in the frame of the chunk or the world.
+
+    A disabled camera, one that is not aligned, and a sensor of another type that only they use are there, too.
+    """
+    write_images(world, folder / "images")
+    write_lists(world, folder)
+    outer = similarity(1) if chunk else np.eye(4)
+    inner = [similarity(2), similarity(3)]
+    width, height = world.size
+    sensors = "".join(
+        f'<sensor id="{i}" label="S{i}" type="{kind}"><resolution width="{width}" height="{height}"/></sensor>'
+        for i, kind in enumerate(("spherical", "spherical", "frame"))
+    )
+    components = "".join(
+        f'<component id="{i}" label="Component {i}">{_metashape_transform(matrix)}</component>'
+        for i, matrix in enumerate(inner)
+    )
+    cameras = [
+        '<camera id="90" sensor_id="2" component_id="0" label="off" enabled="false"><transform>1</transform></camera>',
+        '<camera id="91" sensor_id="2" label="lost"/>',
+    ]
+    for i, name in enumerate(world.names):
+        pose = np.linalg.inv(outer @ inner[i % 2]) @ world.world_from_cam(i)
+        pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+        cameras.append(
+            f'<camera id="{i}" sensor_id="{i % 2}" component_id="{i % 2}" label="{name}" enabled="true">'
+            f"<transform>{' '.join(map(repr, pose.ravel().tolist()))}</transform></camera>"
+        )
+    groups = f'<group id="0" label="Group 1">{"".join(cameras[:4])}</group>{"".join(cameras[4:])}'
+    (folder / "cameras.xml").write_text(
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0"><chunk label="Chunk 1" enabled="true">'
+        f"<sensors>{sensors}</sensors><components>{components}</components><cameras>{groups}</cameras>"
+        f"{_metashape_transform(outer) if chunk else ''}</chunk></document>"
+    )
+    frame = np.linalg.inv(outer) if cloud == "chunk" else np.eye(4)
+    points = world.points @ frame[:3, :3].T + frame[:3, 3]
+    write_cloud(replace(world, points=points), folder / "dense.ply")
+
+
+def _metashape_transform(matrix: NDArray[np.float64]) -> str:
+    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    parts = {"rotation": matrix[:3, :3] / scale, "translation": matrix[:3, 3], "scale": scale}
+    text = "".join(f"<{key}>{' '.join(map(repr, np.ravel(x).tolist()))}</{key}>" for key, x in parts.items())
+    return f"<transform>{text}</transform>"
+
+
+PANORAMA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x ahead, y left, z up, in camera axes
+
+
+def write_navvis(world: World, folder: Path, turn: float = 0.0) -> None:
+    """Write pano-poses.csv; images are turned by `turn` degrees to the left of what the poses say."""
+    write_images(world, folder / "pano")
+    write_lists(world, folder)
+    write_cloud(world, folder / "pointcloud.ply")
+    head = "filename; timestamp; pano_pos_x; pano_pos_y; pano_pos_z; pano_ori_w; pano_ori_x; pano_ori_y; pano_ori_z"
+    rows = [f"# pano poses v1.0: ID; {head}"]
+    for i, name in enumerate(world.names):
+        axes = PANORAMA @ Rotation.from_euler("z", -turn, degrees=True).as_matrix()
+        numbers = [*world.centers[i], *quaternion(axes.T @ world.rotations[i], inverse=True)]
+        rows.append("; ".join([str(i), f"{name}.png", "1644454371.893008", *(repr(float(x)) for x in numbers)]))
+    (folder / "pano" / "pano-poses.csv").write_text("\n".join(rows) + "\n")
+
+
 WRITERS = {
     "colmap": write_colmap_binary,
     "transforms": write_transforms,
@@ -244,12 +316,14 @@ WRITERS = {
     "ricoh360": write_ricoh360,
     "omniblender": write_omniblender,
     "released": write_released,
+    "metashape": write_metashape,
+    "navvis": write_navvis,
 }
 
 
-def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion(rotation: NDArray[np.float64], inverse: bool = False) -> NDArray[np.float64]:
     """Return (w, x, y, z), w >= 0."""
-    return np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1)
+    return np.roll(Rotation.from_matrix(rotation.T if inverse else rotation).as_quat(canonical=True), 1)
 
 
 def _exit(center: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatch
 from pathlib import Path
 
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.colmap import find_model
+from padgs.data.formats.metashape import find_xml
 
 # Files that together identify a format, most specific first: folders of published data sets also hold files of general
 # formats. No files: a COLMAP model.
@@ -19,9 +21,21 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("transforms", ("transforms_train.json",)),
     ("openmvg", ("sfm_data.json",)),
     ("opensfm", ("reconstruction.json",)),
+    ("metashape", ("*.xml",)),
+    ("navvis", ("pano-poses.csv",)),
+    ("navvis", ("pano/pano-poses.csv",)),
+    ("e57", ("*.e57",)),
 )
 # Files that may be given instead of their folder.
-ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json")
+ALONE = (
+    "transform.json",
+    "transforms.json",
+    "sfm_data.json",
+    "reconstruction.json",
+    "*.xml",
+    "pano-poses.csv",
+    "*.e57",
+)
 
 
 def detect(path: Path) -> tuple[str, str]:
@@ -34,17 +48,20 @@ def detect(path: Path) -> tuple[str, str]:
     for format, files in SIGNS:
         if not files and path.is_dir() and (model := find_model(path)):
             found[format] = f"the COLMAP model in {model.relative_to(path)}"
-        elif files == (path.name,) and path.is_file() and path.name in ALONE:
+        elif path.is_file() and files and files[0] in ALONE and fnmatch(path.name.lower(), files[0]):
             found[format] = path.name
-        elif files and all((path / file).exists() for file in files):
-            found.setdefault(format, " and ".join(files))
+        elif format == "metashape":
+            if path.is_dir() and (xml := find_xml(path)):
+                found[format] = xml.name
+        elif files and all(there := [next(iter(sorted(path.glob(file))), None) for file in files]):
+            found.setdefault(format, " and ".join(file.relative_to(path).as_posix() for file in there if file))
     if not found:
         inside = listed(sorted(child.name for child in path.iterdir())) if path.is_dir() else "a file"
         raise DataError(
             f"{path} has no known format; it holds {inside or 'nothing'}. Known: a COLMAP model (sparse/0), "
-            "transforms.json, sfm_data.json, reconstruction.json, pose_c2w.json (360Roam), output_dir/colmap "
-            "(Ricoh360), transform.json (OmniBlender), data_views.json with data_extrinsics.json. Panoramas without "
-            "poses: run `padgs prepare IMAGES OUT` first"
+            "transforms.json, sfm_data.json, reconstruction.json, cameras.xml (Metashape), pano-poses.csv (NavVis), "
+            "an .e57 file, pose_c2w.json (360Roam), output_dir/colmap (Ricoh360), transform.json (OmniBlender), "
+            "data_views.json with data_extrinsics.json. Panoramas without poses: run `padgs prepare IMAGES OUT` first"
         )
     name, *others = found
     reason = f"format: {name}, detected by {found[name]}"

@@ -1,0 +1,154 @@
+"""Point clouds of scanners: LAS, LAZ and E57, through laspy and pye57, which `padgs[scanners]` installs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from padgs.checks import install_command
+from padgs.data.capture import Cloud, DataError, refuse_special
+from padgs.data.cloud import color_bytes
+
+MOST_POINTS = 1_000_000  # of a scan; more are thinned out evenly, because training starts from each of them
+CHUNK = 1_000_000  # points in memory at a time
+CHANNELS = ("red", "green", "blue")
+
+
+def optional_module(name: str, path: Path) -> Any:
+    """Import the package that reads a file.
+
+    Raises:
+        DataError: it is not installed; the message says how to install it.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise DataError(
+            f"{path} needs {name}, which cannot be imported ({error}); install it: {install_command('scanners')}"
+        ) from error
+
+
+@contextmanager
+def _readable(path: Path, again: str) -> Iterator[None]:
+    refuse_special(path)
+    if not path.exists():
+        raise DataError(f"the point cloud {path} does not exist")
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:  # both packages raise what their libraries raise
+        why = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"{path} is cut short, damaged or of another kind ({why}); {again}") from error
+
+
+def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
+    """Read a LAS or LAZ file, and notes. Colours may have 8 or 16 bits.
+
+    Raises:
+        DataError: laspy or a decoder of LAZ is missing, or the file is damaged.
+    """
+    laspy = optional_module("laspy", path)
+    with _readable(path, "export it again as LAS 1.2 to 1.4"), laspy.open(path) as file:
+        step = -(-file.header.point_count // MOST_POINTS) or 1
+        coloured = set(CHANNELS) <= set(file.header.point_format.dimension_names)
+        points, colors, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint16)], 0
+        for chunk in file.chunk_iterator(CHUNK):
+            some = slice(-start % step, None, step)
+            points.append(np.stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)], axis=1)[some])
+            if coloured:
+                colors.append(np.stack([np.asarray(chunk[name]) for name in CHANNELS], axis=1)[some])
+            start += len(chunk)
+        if start != file.header.point_count:
+            raise DataError(f"{path} states {file.header.point_count} points but holds {start}; copy it again")
+    paint = color_bytes(np.concatenate(colors), str(path)) if coloured else None
+    return _thinned(path, np.concatenate(points), paint, step)
+
+
+def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:
+    """Read the points of all scans of an E57 file in the file's common frame, and notes.
+
+    Colours are scaled by the range that the file states for their type.
+
+    Raises:
+        DataError: pye57 is missing, or the file is damaged.
+    """
+    with open_e57(path) as file:
+        headers = [file.get_header(index) for index in range(file.scan_count)]
+        step = -(-sum(header.point_count for header in headers) // MOST_POINTS) or 1
+        points, colors = [np.zeros((0, 3))], []
+        for header in headers:
+            found, paint = _scan(file, header, step)
+            points.append(found)
+            colors.append(paint if len(found) else np.zeros((0, 3), np.uint8))
+    coloured = bool(colors) and all(paint is not None for paint in colors)
+    return _thinned(path, np.concatenate(points), torch.from_numpy(np.concatenate(colors)) if coloured else None, step)
+
+
+@contextmanager
+def open_e57(path: Path) -> Iterator[Any]:
+    """Open an E57 file with pye57; errors of its library become a DataError that names the file."""
+    pye57 = optional_module("pye57", path)
+    with _readable(path, "export it again"):
+        file = pye57.E57(str(path))
+        try:
+            yield file
+        finally:
+            file.close()
+
+
+def _scan(file: Any, header: Any, step: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return every `step`-th valid point [P, 3] of a scan in the file's frame, and its colours [P, 3]."""
+    fields, spherical = set(header.point_fields), "cartesianX" not in header.point_fields
+    axes = [f"cartesian{axis}" for axis in "XYZ"]
+    if spherical:
+        axes = [f"spherical{name}" for name in ("Range", "Azimuth", "Elevation")]
+    paint = [f"color{name.title()}" for name in CHANNELS]
+    coloured = set(paint) <= fields
+    invalid = [name for name in ("cartesianInvalidState", "sphericalInvalidState") if name in fields]
+    columns, buffers = {}, file.make_buffers([], 0)[1]
+    for name in [*axes, *(paint if coloured else []), *invalid]:
+        columns[name] = np.empty(CHUNK, np.float64)
+        buffers.append(
+            import_module("pye57").libe57.SourceDestBuffer(file.image_file, name, columns[name], CHUNK, True, True)
+        )
+    reader, points, colors, start = header.points.reader(buffers), [np.zeros((0, 3))], [np.zeros((0, 3))], 0
+    while count := reader.read():
+        some = np.arange(-start % step, count, step)
+        for name in invalid:
+            some = some[columns[name][some] == 0]
+        points.append(np.stack([columns[name][some] for name in axes], axis=1))
+        if coloured:
+            colors.append(np.stack([columns[name][some] for name in paint], axis=1))
+        start += count
+    found = np.concatenate(points)
+    if spherical:
+        radius, azimuth, elevation = found.T
+        level = radius * np.cos(elevation)
+        found = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), radius * np.sin(elevation)], axis=1)
+    if header.has_pose():
+        found = file.to_global(found, header.rotation, header.translation)
+    if not coloured:
+        return found, None
+    kinds = import_module("pye57").libe57.StructureNode(header.points.prototype())
+    types = [_integer_type(kinds[name]) for name in paint]
+    values = np.concatenate(colors)
+    return found, color_bytes(values.astype(types[0]) if types[0] else values, f"scan {header.guid}").numpy()
+
+
+def _integer_type(node: Any) -> type | None:
+    """Return the smallest NumPy type that holds a whole colour of an E57 file; None for floats."""
+    if type(node).__name__ != "IntegerNode":
+        return None
+    return next((kind for kind in (np.uint8, np.uint16) if node.maximum() <= np.iinfo(kind).max), np.uint32)
+
+
+def _thinned(path: Path, points: np.ndarray, colors: Any, step: int) -> tuple[Cloud, tuple[str, ...]]:
+    notes = (f"points: every {step}th of {path.name}, {len(points)} in all",) if step > 1 else ()
+    return Cloud(torch.from_numpy(points), colors), notes

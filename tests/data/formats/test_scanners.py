@@ -1,0 +1,162 @@
+"""Captures and clouds of scanners: NavVis, E57 and LAS."""
+
+import importlib
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from support.fixtures import PANORAMA, World, quaternion, write_images, write_navvis
+
+from padgs.data import DataError, load, read
+from padgs.data import scans as scans_module
+from padgs.data.cloud import read_cloud
+
+
+@pytest.mark.parametrize(("turn", "along"), [(0, "x"), (90, "y"), (180, "-x"), (-90, "-y")])
+def test_turned_images_of_navvis_are_recognised_by_colours(turn: float, along: str, world: World, tmp_path: Path):
+    write_navvis(world, tmp_path, turn)
+    scene = load(tmp_path)
+    assert any(f"centres of images along {along} of their poses (colours agree by 0.9" in note for note in scene.notes)
+    for view in scene.train:
+        rotation = torch.from_numpy(world.rotations[world.names.index(view.name)])
+        torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("; pano_ori_w", "", r"pano-poses.csv, line 1 lacks the columns pano_ori_w; export"),
+        (
+            "1644454371.893008; ",
+            "1644454371.893008; x",
+            r"pano-poses.csv, line 2: '0; pano_00.png; .* is not ID; filename",
+        ),
+        ("1644454371.893008; ", "", r"pano-poses.csv, line 2: '0; pano_00.png; .* is not ID; filename"),
+        ("1644454371.893008; ", "1644454371.893008; nan", r"pano-poses.csv, line 2"),
+        ("pano_00", "../pano_00", r"names '../pano_00.png'|6 views|"),
+    ],
+)
+def test_invalid_rows_of_navvis_are_refused(old: str, new: str, message: str, world: World, tmp_path: Path) -> None:
+    write_navvis(world, tmp_path)
+    file = tmp_path / "pano" / "pano-poses.csv"
+    file.write_text(file.read_text().replace(old, new, 1))
+    if old == "pano_00":
+        assert len(load(file).train) == 4, "names are found by their end"
+        return
+    with pytest.raises(DataError, match=message):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["pye57", "laspy"])
+def test_missing_packages_are_named(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, name, None)
+    file = tmp_path / ("a.e57" if name == "pye57" else "a.laz")
+    file.write_bytes(b"no scan")
+    with pytest.raises(
+        DataError, match=rf"a\.\w+ needs {name}, which cannot be imported .*pip install 'padgs\[scanners\]'"
+    ):
+        read_cloud(file)
+
+
+@pytest.fixture
+def laspy() -> ModuleType:
+    return pytest.importorskip("laspy", reason="laspy is not installed: pip install 'padgs[scanners]'")
+
+
+@pytest.mark.parametrize(("end", "scale", "coloured"), [("las", 257, True), ("laz", 1, True), ("las", 1, False)])
+def test_las_clouds(end: str, scale: int, coloured: bool, laspy, world: World, tmp_path: Path, monkeypatch) -> None:
+    data = laspy.LasData(laspy.LasHeader(point_format=2 if coloured else 1, version="1.2"))
+    data.header.scales, data.header.offsets = [1e-6] * 3, world.points.mean(0)
+    data.x, data.y, data.z = world.points.T
+    if coloured:
+        data.red, data.green, data.blue = world.colors.T.astype(np.uint16) * scale
+    data.write(str(tmp_path / f"cloud.{end}"))
+    write_navvis(world, tmp_path)
+    scene = load(tmp_path, points=f"cloud.{end}")
+    torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float(), atol=2e-6, rtol=0)
+    grey = "points: the cloud has no colours; grey is used"
+    assert torch.equal(scene.point_colors, torch.from_numpy(world.colors)) if coloured else grey in scene.notes
+    monkeypatch.setattr(scans_module, "MOST_POINTS", 150)
+    monkeypatch.setattr(scans_module, "CHUNK", 64)
+    cloud, notes = read_cloud(tmp_path / f"cloud.{end}")
+    assert notes == (f"points: every 3th of cloud.{end}, 134 in all",)
+    np.testing.assert_allclose(cloud.points, world.points[::3], atol=2e-6)
+    whole = (tmp_path / f"cloud.{end}").read_bytes()
+    (tmp_path / f"cloud.{end}").write_bytes(whole[:-900])
+    with pytest.raises(DataError, match=rf"cloud.{end} (is cut short, damaged|states 400 points but holds)"):
+        read_cloud(tmp_path / f"cloud.{end}")
+
+
+@pytest.fixture
+def e57(world: World, tmp_path: Path) -> Path:
+    pytest.importorskip("pye57", reason="pye57 is not installed: pip install 'padgs[scanners]'")
+    return write_e57(world, tmp_path / "scan.e57")
+
+
+def write_e57(world: World, path: Path, pose: str = "translation", kind: str = "sphericalRepresentation") -> Path:
+    """Write points with a pose of their own, and panoramas; `pose` and `kind` name the elements."""
+    pye57 = importlib.import_module("pye57")
+    lib = pye57.libe57
+    file = pye57.E57(str(path), mode="w")
+    image_file = file.image_file
+    turn, shift = np.array([0.5, 0.5, 0.5, 0.5]), np.array([1.0, 2.0, 3.0])  # x to y to z
+    local = (world.points - shift) @ np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    data = {f"cartesian{axis}": column.copy() for axis, column in zip("XYZ", local.T, strict=True)}
+    data |= {f"color{name}": c.copy() for name, c in zip(("Red", "Green", "Blue"), world.colors.T, strict=True)}
+    file.write_scan_raw(data, rotation=turn, translation=shift)
+    images = file.root["images2D"]
+    if not (path.parent / "made").exists():
+        write_images(world, path.parent / "made")
+
+    def numbers(parent, name: str, keys: str, values) -> None:
+        node = lib.StructureNode(image_file)
+        parent.set(name, node)
+        for key, value in zip(keys, values, strict=True):
+            node.set(key, lib.FloatNode(image_file, float(value)))
+
+    for i, name in enumerate(world.names):
+        image, sphere = lib.StructureNode(image_file), lib.StructureNode(image_file)
+        images.append(image)
+        image.set("name", lib.StringNode(image_file, f"{name}: hall/1"))
+        stated = lib.StructureNode(image_file)
+        image.set("pose", stated)
+        numbers(stated, pose, "xyz", world.centers[i])
+        numbers(stated, "rotation", "wxyz", quaternion(PANORAMA.T @ world.rotations[i], inverse=True))
+        image.set(kind, sphere)
+        content = (path.parent / "made" / f"{name}.png").read_bytes()
+        blob = lib.BlobNode(image_file, len(content))
+        sphere.set("pngImage", blob)
+        blob.write(np.frombuffer(content, np.uint8), 0, len(content))
+    file.close()
+    return path
+
+
+def test_e57_files_hold_panoramas_poses_and_points(e57: Path, world: World) -> None:
+    for path in (e57, e57.parent, e57):
+        scene = load(path, split="all")
+        assert [view.name for view in scene.train] == [f"{name}_ hall_1" for name in world.names]
+        for i, view in enumerate(scene.train):
+            rotation, center = torch.from_numpy(world.rotations[i]), torch.from_numpy(world.centers[i])
+            torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+            torch.testing.assert_close(view.center, center, atol=1e-12, rtol=0)
+            assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[i]))  # type: ignore[misc]
+        torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float(), atol=1e-6, rtol=0)
+        assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
+
+
+def test_e57_files_without_panoramas_or_poses_are_refused(e57: Path, world: World) -> None:
+    write_e57(world, e57.with_name("b.e57"), pose="place")
+    with pytest.raises(
+        DataError, match=r"images2D\[0\] 'pano_00_ hall_1' of .*b.e57 has no pose; export the panoramas"
+    ):
+        read(e57.with_name("b.e57"))
+    write_e57(world, e57.with_name("c.e57"), kind="pinholeRepresentation")
+    with pytest.raises(DataError, match=r"c.e57 holds no panorama \(images2D with a sphericalRepresentation\)"):
+        read(e57.with_name("c.e57"))
+    assert len(read_cloud(e57.with_name("c.e57"))[0].points) == 400
+    e57.write_bytes(e57.read_bytes()[:3000])
+    with pytest.raises(DataError, match="scan.e57 is cut short, damaged or of another kind"):
+        read(e57)
