@@ -1,4 +1,4 @@
-"""Print the table of docs/cuda.md: deviations of backend cuda from the definition in float64.
+"""Print the numbers of docs/notes/gpu.md: deviations of backend cuda from the definition in float64.
 
     python docs/cuda_parity.py
 

@@ -2,7 +2,7 @@
 
     python docs/footprint_error.py
 
-writes the table in docs/projections.md and the figure docs/footprint_error.png in about two minutes. Tests compare the
+writes the table in docs/notes/projection_error.md and the figure docs/footprint_error.png in about two minutes. Tests compare the
 table with the numbers computed here.
 
 The truth is the ray response, the largest value of the Gaussian along each ray; projection `ray` computes it, the
@@ -154,7 +154,7 @@ def main() -> None:
         projection: [[footprint_error(projection, sigma, latitude) for latitude in LATITUDES] for sigma in SIGMAS]
         for projection in PROJECTIONS
     }
-    page = FOLDER / "projections.md"
+    page = FOLDER / "notes" / "projection_error.md"
     between = re.compile(r"(<!-- table -->\n).*(<!-- end -->)", re.DOTALL)
     page.write_text(between.sub(lambda found: found[1] + markdown(errors) + "\n" + found[2], page.read_text()))
     draw(errors, FOLDER / "footprint_error.png")

@@ -48,7 +48,7 @@ def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
         panorama: the panorama to resample to.
         face_size: pixels across 90 degrees. If not given, the centre of a face has `FINENESS` times the pixels per
             radian of the panorama, W / 2 pi or H / pi, the larger. With the same resolution, W / pi pixels across,
-            interpolation would blur (docs/projections.md).
+            interpolation would blur (docs/renderer.md).
     """
     focal = FINENESS * max(panorama.width / (2 * pi), panorama.height / pi) if face_size is None else face_size / 2
     size = 2 * (ceil(focal) + 1)

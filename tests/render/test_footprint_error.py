@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from footprint_error import LATITUDES, REFERENCE, SIGMAS, footprint_error
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "projection_error.md"
 
 
 @pytest.mark.parametrize("latitude", [0.0, 60.0, -89.0])

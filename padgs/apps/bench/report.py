@@ -86,7 +86,7 @@ def measure_all(
     """
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/cuda.md")
+        raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/renderer.md")
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         check_place(file)
