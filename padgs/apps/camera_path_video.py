@@ -11,7 +11,9 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
+from typing import BinaryIO
 from uuid import UUID
 
 import numpy as np
@@ -212,34 +214,29 @@ def mark_spherical(video: Path) -> None:
         ValueError: the last box is not the index, or the index has no track.
     """
     with video.open("r+b") as file:
-        found = (b"", 0, 0)
-        end = file.seek(0, 2)
-        start = 0
-        while start < end:
-            file.seek(start)
-            size, kind = struct.unpack(">I4s", file.read(8))
-            if size == 1:  # a 64-bit size follows
-                (size,) = struct.unpack(">Q", file.read(8))
-            found, start = (kind, start, size), start + (size or end - start)
-        kind, start, size = found
+        *_, (kind, start, size) = _boxes(file, 0, file.seek(0, 2))
         if kind != b"moov":
             raise ValueError(f"{video} ends with a box {kind.decode('latin1')!r}; it must end with the index, moov")
         file.seek(start)
         index = file.read(size)
+        tracks = [(at, length) for kind, at, length in _boxes(BytesIO(index), 8, size) if kind == b"trak"]
+        if not tracks:
+            raise ValueError(f"{video} has no track; encode it again")
+        at, length = tracks[0]
+        content = SPHERICAL + XML.encode()
+        box = struct.pack(">I4s", 8 + len(content), b"uuid") + content
         file.seek(start)
-        file.write(_with_box(index))
+        file.write(struct.pack(">I", size + len(box)) + index[4:at])
+        file.write(struct.pack(">I", length + len(box)) + index[at + 4 : at + length] + box + index[at + length :])
 
 
-def _with_box(index: bytes) -> bytes:
-    """Append the box to the first track of the index."""
-    position = 8
-    while position < len(index):
-        size, kind = struct.unpack_from(">I4s", index, position)
-        if kind == b"trak":
-            content = SPHERICAL + XML.encode()
-            box = struct.pack(">I4s", 8 + len(content), b"uuid") + content
-            track = struct.pack(">I", size + len(box)) + index[position + 4 : position + size] + box
-            whole = index[4:position] + track + index[position + size :]
-            return struct.pack(">I", len(whole) + 4) + whole
-        position += size
-    raise ValueError("the video has no track; encode it again")
+def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Yield kind, position and size of the boxes between two positions."""
+    while start < end:
+        file.seek(start)
+        size, kind = struct.unpack(">I4s", file.read(8))
+        if size == 1:  # a 64-bit size follows
+            (size,) = struct.unpack(">Q", file.read(8))
+        size = size or end - start
+        yield kind, start, size
+        start += size

@@ -1,1 +1,1 @@
-"""`padgs`: one file a command."""
+"""`padgs`: commands and their options."""

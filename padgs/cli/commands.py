@@ -1,4 +1,4 @@
-"""The commands of `padgs`, one file each. A command imports slow modules when it is called."""
+"""The commands of `padgs`. A command imports slow modules when it is called."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.errors import without_traceback
 from padgs.cli.export import export
+from padgs.cli.finished import smallest, track
 from padgs.cli.prepare import prepare
 from padgs.cli.render import render
 from padgs.cli.report import report
-from padgs.cli.smallest import smallest
-from padgs.cli.track import track
 from padgs.cli.view import view
 
 app = typer.Typer(no_args_is_help=True)

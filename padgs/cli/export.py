@@ -8,13 +8,10 @@ import typer
 
 from padgs.cli.errors import DataPath, Run, check_range, name_place, printable, show
 
-LONG = 60.0  # seconds of writing; announced beforehand if it takes longer
-
 
 def export(
     run: Run,
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
-    points: Annotated[bool, typer.Option("--points", help="only centres of opaque Gaussians, coloured")] = False,
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="at least a pixel wide, for viewers; .html always is")
@@ -25,29 +22,26 @@ def export(
     ] = None,
     data: DataPath = None,
 ) -> None:
-    """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
+    """Write a run's Gaussians, by default into its folder as splats.ply.
 
     The Gaussians of PaD-GS differ from view to view, so they are baked into explicit ones; the loss is measured,
     printed and written into the file. Viewers that come nearer than the cameras, or have smaller pixels, show thin
     Gaussians as needles; --smooth writes none thinner than a pixel of the nearest photograph. Formats other than .ply
-    are made by splat-transform (npm install -g @playcanvas/splat-transform).
+    are made by splat-transform (npm install -g @playcanvas/splat-transform); .sog and .html can take minutes.
     """
     from pathlib import Path
 
     from rich.console import Console
     from rich.text import Text
 
-    from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run, point_cloud
-    from padgs.apps.export.splat_file import check_suffix, estimate_seconds, write_splats
-    from padgs.data.cloud import write_ply
+    from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run
+    from padgs.apps.export.splat_file import check_suffix, write_splats
     from padgs.files import check_place
     from padgs.runs.load import load_run
 
     check_range(0, 100_000, distillation_steps=distillation_steps)
     steps = DISTILLATION_STEPS if distillation_steps is None else distillation_steps
-    path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
-    if points and path.suffixes != [".ply"]:
-        raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
+    path = Path(to) if to else Path(run) / "splats.ply"
     check_suffix(path)
     with Console().status("opening the run") as status:
         trained = load_run(run, data_path=data)
@@ -61,16 +55,8 @@ def export(
             smooth=smooth or path.suffix == ".html",
             progress=lambda done: status.update(f"distillation step {done} of {steps}"),
         )
-        if not points and (seconds := estimate_seconds(path, found.splats)) > LONG:
-            show(f"{path.name}: its harmonics take some {seconds / 60:.0f} minutes; a .spz or .ply takes seconds")
         status.update(Text(f"writing {printable(path.name)}"))
         with name_place(path):
-            if points:
-                cloud = point_cloud(found.splats)
-                write_ply(path, cloud)
-                what = f"{len(cloud.points)} points"
-            else:
-                write_splats(path, found.splats, found.notes, start=found.start)
-                what = f"{len(found.splats)} Gaussians"
+            write_splats(path, found.splats, found.notes, start=found.start)
     show("\n".join(f"  {note}" for note in found.notes))
-    show(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")
+    show(f"{path}: {len(found.splats)} Gaussians, {path.stat().st_size / 1e6:.1f} MB")

@@ -25,14 +25,12 @@ def view(
     data: DataPath = None,
 ) -> None:
     """Walk through a run in the browser, rendered by its own renderer; a run in training is followed."""
-    from padgs.apps.viewer.process import has_screen, serve
-    from padgs.apps.viewer.server import LOCAL, PORT
+    from padgs.apps.viewer.server import LOCAL, PORT, has_screen, serve, wait_for_checkpoint
 
     check_range(1, 65535, port=port)
     folders = (run, beside) if beside else (run,)
 
     def of_one_scene() -> list[LoadedRun]:
-        from padgs.apps.viewer.process import wait_for_checkpoint
         from padgs.runs.load import load_run
 
         runs, names = [], []

@@ -11,7 +11,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
@@ -23,7 +23,6 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from padgs.apps.viewer.process import serve_training
 from padgs.checks import unknown
 from padgs.multirun.composition import typed_config
 from padgs.results import SMALLEST_STATED, Result
@@ -33,7 +32,7 @@ from padgs.runs.interrupt import Interrupted, answer_signals
 from padgs.runs.load import load_run
 from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
 from padgs.runs.smallest import find_smallest
-from padgs.runs.store import RunBusy, RunStore
+from padgs.runs.store import RunBusy
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
 WAITING, RUNNING, OK = "waiting", "running", "ok"
@@ -148,8 +147,8 @@ def job_of_many(composed: DictConfig) -> str:
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
-            with served_scene(config) as scene:
-                result = run(config, console, entry, scene, brief=not alone)
+            scene = load_scene(config, start(config))
+            result = run(config, console, entry, scene, brief=not alone)
             search_smallest(config, scene, result, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
@@ -162,15 +161,6 @@ def job_of_many(composed: DictConfig) -> str:
         except Exception as error:
             say(console, traceback.format_exc())
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
-
-
-@contextmanager
-def served_scene(config: RunConfig) -> Iterator[Scene]:
-    """Load the scene of a run, and show the run in the browser while the context lasts if that is requested."""
-    scene = load_scene(config, start(config))
-    folder = RunStore.of(config, scene).path
-    with serve_training(folder, config.data.path, config.run.device) if config.run.view else nullcontext():
-        yield scene
 
 
 def search_smallest(config: RunConfig, scene: Scene, result: Result, console: Console, callback: Callback) -> None:

@@ -24,10 +24,10 @@ def main() -> None:
             from rich.console import Console
 
             from padgs.multirun.composition import composing, configuration, multirun
-            from padgs.multirun.job import OK, search_smallest, served_scene
+            from padgs.multirun.job import OK, search_smallest
             from padgs.multirun.sweep import sweep
             from padgs.runs.console import say
-            from padgs.runs.run import Callback, run
+            from padgs.runs.run import Callback, load_scene, run, start
             from padgs.runs.tracking import Tracker
 
             with composing() as loader:
@@ -37,8 +37,8 @@ def main() -> None:
                     config, console = configuration(arguments), Console()
                     runs, experiment = Path(config.run.folder), " ".join(config.labels.experiments)
                     tracker = Tracker(config.tracking, runs, experiment, lambda line: say(console, line, "dim"))
-                    with served_scene(config) as scene:
-                        result = run(config, console, scene=scene)
+                    scene = load_scene(config, start(config))
+                    result = run(config, console, scene=scene)
                     search_smallest(config, scene, result, console, Callback())
                     tracker.add(runs / result.run)
                     ends = {result.status}

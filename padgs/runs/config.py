@@ -31,7 +31,6 @@ DEVICES = ("auto", "cpu", "cuda")
 RETRIES = ("none", "failed")
 SWITCH = ("off", "on")
 IMAGES_ON = ("device", "cpu")
-WATCHED = 5.0  # longest time in seconds between checkpoints of a run shown in the browser
 CONTINUED = "continued"  # label of runs with `init` in tables
 
 
@@ -110,7 +109,6 @@ class RunOptions:
     probe_every: int = 100  # iterations between renders of one test view, the held-out PSNR of the live line
     checkpoint_every: int | None = None  # iterations between checkpoints; null = only by time
     checkpoint_seconds: float = 60.0  # longest time between checkpoints
-    view: bool = False  # show the run in the browser while it trains, a checkpoint every few seconds
     pictures: bool = True  # save ground truth | render | error of each test view
 
     def __post_init__(self) -> None:
@@ -118,11 +116,6 @@ class RunOptions:
         counts = ("jobs", "threads", "log_every", "probe_every", "checkpoint_every")
         check(self, "at least 1", lambda count: count is None or count >= 1, *counts)
         check(self, ">= 0", lambda seconds: seconds >= 0, "checkpoint_seconds")
-
-    @property
-    def seconds_between_checkpoints(self) -> float:
-        """Longest time between checkpoints, shorter if the run is shown in the browser."""
-        return min(self.checkpoint_seconds, WATCHED) if self.view else self.checkpoint_seconds
 
     @property
     def threads_per_job(self) -> int | None:

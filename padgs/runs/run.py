@@ -107,7 +107,7 @@ def run(
                         ending = ending and method.request_stop(STOP_REQUESTED)
                         every = config.run.checkpoint_every
                         due = every is not None and record.iteration % every == 0
-                        due = due or time.monotonic() - saved_at > config.run.seconds_between_checkpoints
+                        due = due or time.monotonic() - saved_at > config.run.checkpoint_seconds
                         if interrupted or ending or due:
                             store.save(method, progress)
                             callback.saved(store.path)

@@ -21,7 +21,7 @@ from padgs.runs import candidates as rules
 from padgs.runs import smallest as search
 from padgs.runs.candidates import Candidate, band_shares, knee, loss, lower_bound, next_count, objections
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.run import Callback, run
+from padgs.runs.run import Callback, load_scene, run, start
 from padgs.runs.smallest import Search, find_smallest
 from padgs.scene import View
 from padgs.training.health import validation_folds
@@ -293,8 +293,8 @@ def test_a_run_with_smallest_on_is_the_same_run_and_is_searched_at_its_end(tmp_p
     with composing():
         config = configuration(settings)
         assert config.values() == configuration([*settings, "smallest=off"]).values()
-    with job.served_scene(config) as scene:
-        result = run(config, Console(width=400), scene=scene)
+    scene = load_scene(config, start(config))
+    result = run(config, Console(width=400), scene=scene)
     job.search_smallest(config, scene, result, Console(width=400), Callback())
     searched_run = padgs.load_run(tmp_path / result.run, device="cpu").result
     assert searched_run is not None

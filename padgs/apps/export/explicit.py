@@ -1,4 +1,4 @@
-"""Conversion of runs to explicit Gaussians or point clouds, and similarity transforms of explicit Gaussians."""
+"""Conversion of runs to explicit Gaussians, and similarity transforms of explicit Gaussians."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 import padgs
 from padgs.apps.export.bake import bake, distill, sample_cameras
 from padgs.data.camera_paths import gravity
-from padgs.data.capture import Cloud, DataError
+from padgs.data.capture import DataError
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
@@ -25,7 +25,6 @@ from padgs.scene import View
 from padgs.training.align import Similarity
 
 DISTILLATION_STEPS = 300
-MIN_POINT_OPACITY = 0.5  # of Gaussians that are exported as points
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"
 
 
@@ -127,14 +126,6 @@ def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None
         f"baked: {len(splats)} of {method.size().counts['gaussians']} Gaussians are visible; WS-PSNR of the {kind} "
         f"views {after:.2f} dB, {before - after:.2f} dB below the run's {before:.2f} dB"
     )
-
-
-@torch.no_grad()
-def point_cloud(splats: Splats) -> Cloud:
-    """Return the centres of opaque Gaussians, with their mean colours over all directions."""
-    opaque = torch.sigmoid(splats.opacity_logits) >= MIN_POINT_OPACITY
-    colors = (0.5 + harmonics.DC * splats.sh_dc[opaque]).clamp(0, 1)
-    return Cloud(splats.means[opaque].double().cpu(), (255 * colors).round().to(torch.uint8).cpu())
 
 
 DOWN = (0.0, 1.0, 0.0)  # in most viewers of 3DGS files, as in most structure from motion

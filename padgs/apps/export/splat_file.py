@@ -9,7 +9,6 @@ option (`--sh_degree` of 3DGS). Padding with zeros would make small files three 
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import subprocess
 import tempfile
@@ -28,8 +27,6 @@ from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
-WITH_PALETTE = (".sog", ".html")  # the converter compares harmonics of all Gaussians with all of a palette
-COMPARISON_SECONDS = 7e-8  # on one core; 100 000 Gaussians take 8 minutes
 _POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*_POSITION, *_COLOR, *_LAST)
@@ -77,14 +74,6 @@ def _convert(source: Path, target: Path, *more: str) -> None:
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         if done.returncode:
             raise ValueError(f"{CONVERTER} could not convert {source} to {target}: {done.stdout.strip()[-500:]}")
-
-
-def estimate_seconds(path: Path, splats: Splats) -> float:
-    """Estimate the time that the converter compares harmonics; 0 for formats without a palette."""
-    if path.suffix not in WITH_PALETTE or splats.active_degree == 0:
-        return 0.0
-    palette = min(1 << 16, 1 << int(math.log2(max(1, len(splats)))))  # as in splat-transform
-    return COMPARISON_SECONDS * len(splats) * palette
 
 
 def check_suffix(path: Path) -> None:

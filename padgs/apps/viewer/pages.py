@@ -83,12 +83,8 @@ class Page:
         self._offers = {"camera": CAMERAS, "layer": LAYERS, "run": runs, "fov": FOVS, "width": WIDTHS}
         self._target = gui.add_dropdown("go to", ("", *self._views))
         self._frusta_shown = gui.add_checkbox("cameras", initial_value=False)
-        if any(renderer.run.result is None for renderer in renderers):
-            is_following = any(renderer.is_following for renderer in renderers)
-            follow = gui.add_checkbox("follow training", initial_value=is_following)
-            follow.on_update(lambda _: self._follow(follow.value))
-            if may_stop:
-                gui.add_button("stop and score", hint="end training now").on_click(lambda _: self._confirm_stop())
+        if may_stop and any(renderer.run.result is None for renderer in renderers):
+            gui.add_button("stop and score", hint="end training now").on_click(lambda _: self._confirm_stop())
         with gui.add_folder("crop", expand_by_default=False):
             can_crop = all(renderer.can_crop for renderer in renderers)
             self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not can_crop)
@@ -151,10 +147,6 @@ class Page:
         width, height = sides(int(self._width.value), camera.aspect)
         renderers = self._renderers if self._run.value == BOTH else (self._by_name[self._run.value],)
         return PageState(options, torch.from_numpy(pose), width, height, renderers)
-
-    def _follow(self, is_following: bool) -> None:
-        for renderer in self._renderers:  # shared by all pages
-            renderer.is_following = is_following
 
     def _confirm_stop(self) -> None:
         gui = self._client.gui

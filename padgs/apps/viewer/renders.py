@@ -34,16 +34,11 @@ class ViewOptions:
 
 
 class RunRenderer:
-    """Renderer of a run, finished or in training.
-
-    Attributes:
-        run: the run.
-        is_following: whether `update` loads newer checkpoints.
-    """
+    """Renderer of a run: of a finished one, or of the newest checkpoint of one that was in training at first."""
 
     def __init__(self, run: LoadedRun) -> None:
         """Prepare the caches."""
-        self.run, self.is_following, self._failure = run, run.result is None, ""
+        self.run, self._is_following, self._failure = run, run.result is None, ""
         self._method = lru_cache(maxsize=2)(self._method_for)
         self._error = lru_cache(maxsize=8)(self._error_image)
 
@@ -69,7 +64,7 @@ class RunRenderer:
         """Load a newer checkpoint, or record why that failed; returns whether anything changed."""
         failure, run = "", None
         try:
-            run = self.run.renewed() if self.is_following else None
+            run = self.run.renewed() if self._is_following else None
         except Exception as error:  # often temporary, while the next checkpoint is written
             failure = str(error)
         changed, self._failure = failure != self._failure, failure

@@ -1,4 +1,4 @@
-"""Web server of the viewer: viser, by default for this machine only.
+"""Web server of the viewer: viser, by default for this machine only, and only for browsers that have a token.
 
 Imports no torch, so that browsers can load the page while torch and the runs are loading.
 """
@@ -6,20 +6,32 @@ Imports no torch, so that browsers can load the page while torch and the runs ar
 from __future__ import annotations
 
 import errno
+import os
 import secrets
 import socket
-from collections.abc import Iterator
+import sys
+import time
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs
 
-from padgs.apps.viewer.access import guard
-from padgs.checks import install_command
+from padgs.checks import install_command, printable
 
-LOCAL, PORT = "127.0.0.1", 8080
-ALL_INTERFACES = "0.0.0.0"
+if TYPE_CHECKING:
+    from padgs.runs.load import LoadedRun
+
+LOCAL, ALL_INTERFACES, PORT = "127.0.0.1", "0.0.0.0", 8080
+LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 PORTS_TRIED = 1000
+POLL_SECONDS = 0.5
+MAX_BYTES = 1 << 20  # of a message
+REFUSAL = "Open the whole address that padgs printed, with its token.\n"
 
 
 @dataclass(frozen=True)
@@ -29,6 +41,34 @@ class Server:
     address: str  # URL with the token that lets browsers in
     viser: Any  # the `viser.ViserServer`
     is_local: bool  # whether it serves only this machine
+
+
+def serve(
+    load_runs: Callable[[], Sequence[LoadedRun]], *, host: str = LOCAL, port: int = PORT, browse: bool = False
+) -> None:
+    """Serve a page, print its address, and show runs until Ctrl-C.
+
+    Args:
+        load_runs: returns one run, or two to compare; called while browsers load the page, because both take seconds.
+        host, port: as in `start_server`.
+        browse: also open the page in a browser, if it is local.
+
+    Raises:
+        ValueError, OSError: from `start_server` or `load_runs`.
+        KeyboardInterrupt: on Ctrl-C.
+    """
+    with start_server(host=host, port=port) as server:
+        print(f"{server.address}  (Ctrl-C ends it)", flush=True)
+        if browse and server.is_local:
+            webbrowser.open(server.address)
+        message = server.viser.gui.add_markdown("opening the run")
+        runs = load_runs()
+        from padgs.apps.viewer.pages import show_runs  # also slow
+
+        message.remove()
+        with show_runs(server, runs):
+            while True:
+                time.sleep(POLL_SECONDS)
 
 
 @contextmanager
@@ -61,6 +101,60 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
     finally:
         with redirect_stdout(None):
             server.stop()
+
+
+@contextmanager
+def guard(token: str, *, is_local: bool) -> Iterator[list[int]]:
+    """Guard the viser servers that start inside the context: only holders of the token are served.
+
+    viser has no hook for this; it starts its server by `websockets.asyncio.server.serve`, which is replaced meanwhile.
+
+    Args:
+        token: expected in the address; a cookie keeps it for the websocket, whose address viser builds without it.
+        is_local: also refuse all host names but those of this machine, against DNS rebinding.
+
+    Returns:
+        The ports of guarded servers.
+    """
+    from websockets.asyncio import server as websockets
+
+    serve, ports = websockets.serve, []
+
+    def guarded_serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            try:
+                response = process_request(connection, request)  # first, because it silences logs of refusals
+            except Exception:  # of any path, such as one too long for a file
+                response = connection.respond(HTTPStatus.NOT_FOUND, "")
+            cookie = f"padgs-{connection.local_address[1]}={token}"
+            given = parse_qs(request.path.partition("?")[2]).get("token", [])
+            cookies = [item.strip() for line in request.headers.get_all("Cookie") for item in line.split(";")]
+            has_token = any(secrets.compare_digest(one.encode(), token.encode()) for one in given)
+            has_cookie = any(secrets.compare_digest(one.encode(), cookie.encode()) for one in cookies)
+            if not (has_token or has_cookie) or is_foreign(request.headers, is_local=is_local):
+                return connection.respond(HTTPStatus.FORBIDDEN, REFUSAL)
+            if response is not None:
+                response.headers["X-Frame-Options"] = "DENY"
+                if has_token:
+                    response.headers["Set-Cookie"] = f"{cookie}; Path=/; HttpOnly; SameSite=Strict"
+            return response
+
+        ports.append(port)
+        return serve(handler, host, port, **options | {"process_request": process, "max_size": MAX_BYTES})
+
+    websockets.serve = guarded_serve
+    try:
+        yield ports
+    finally:
+        websockets.serve = serve
+
+
+def is_foreign(headers: Any, *, is_local: bool) -> bool:
+    """Return whether a request is for another host, or from a page of another origin."""
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(hosts) != 1 or is_local and (hosts[0].rpartition(":")[0] or hosts[0]) not in LOOPBACK_NAMES:
+        return True
+    return not {*origins} <= {f"http://{hosts[0]}", f"https://{hosts[0]}"}
 
 
 def free_port(host: str, first: int) -> int:
@@ -108,3 +202,27 @@ def viser_module() -> ModuleType:
     except ImportError as error:
         raise ValueError(f"the viewer needs viser: {install_command('view')}") from error
     return viser
+
+
+def has_screen() -> bool:
+    """Return whether there is a graphical screen; without one, text browsers would take over the terminal."""
+    windows = sys.platform == "darwin" or not {"DISPLAY", "WAYLAND_DISPLAY"}.isdisjoint(os.environ)
+    return sys.stdout.isatty() and windows and "SSH_CONNECTION" not in os.environ
+
+
+def wait_for_checkpoint(folder: str | Path) -> None:
+    """Return when a run has a checkpoint, or will have none; opening it then reports the reason.
+
+    Raises:
+        ValueError: the run was started, but no process trains it.
+    """
+    from padgs.runs.store import RunStore
+
+    store, printed = RunStore(Path(folder)), False
+    while not (store.has_checkpoint or store.has_result) and store.config.is_file():
+        if not store.is_busy and not (store.has_checkpoint or store.has_result):  # it may have ended since
+            raise ValueError(f"{folder} has no checkpoint, and no process trains it; start the same padgs-run again")
+        if not printed:
+            print(f"waiting for the first checkpoint of {printable(str(folder))}  (Ctrl-C ends it)", flush=True)
+        printed = True
+        time.sleep(POLL_SECONDS)

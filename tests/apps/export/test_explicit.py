@@ -16,7 +16,6 @@ import padgs
 from padgs.apps.export.explicit import export_run, harmonics_rotation, transform_splats, upright_rotation
 from padgs.apps.export.splat_file import read_splats
 from padgs.cli.commands import app
-from padgs.data.cloud import read_ply
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import protocol_from_options
 from padgs.geometry import harmonics
@@ -86,13 +85,10 @@ def test_refined_poses_are_aligned_with_the_scene(tmp_path_factory):
     assert (run.method.model.render(view).image - own).abs().max() > 0.05, "it is another world"
 
 
-def test_points_and_upright_worlds(splat_run, tmp_path):
-    assert export(str(splat_run), "--points", "--to", str(tmp_path / "new" / "p.ply")).exit_code == 0
-    cloud = read_ply(tmp_path / "new" / "p.ply")
-    assert len(cloud.points) > 10 and cloud.colors is not None
-    assert export(str(splat_run), "--upright", "--to", str(tmp_path / "u.ply")).exit_code == 0
-    assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply"))["vertex"].comments)
-    up, plain = read_splats(tmp_path / "u.ply").means, padgs.load_run(splat_run).method.model.splats.means
+def test_upright_worlds(splat_run, tmp_path):
+    assert export(str(splat_run), "--upright", "--to", str(tmp_path / "new" / "u.ply")).exit_code == 0
+    assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "new" / "u.ply"))["vertex"].comments)
+    up, plain = read_splats(tmp_path / "new" / "u.ply").means, padgs.load_run(splat_run).method.model.splats.means
     assert torch.allclose(-up[:, 1], plain[:, 2], atol=1e-4), "z is up in the built-in room"
 
 
@@ -112,7 +108,6 @@ def test_methods_without_gaussians_are_refused(tmp_path_factory, tmp_path, splat
         ((str(folder),), "egonerf has no Gaussians to export; use padgs render or padgs view"),
         ((str(tmp_path / "RUNX"),), "has no config.yaml"),
         ((str(splat_run), "--to", "a.obj"), "has an unknown format"),
-        ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),
         ((str(splat_run), "--to", str(tmp_path / "file" / "a.ply")), "name another place with --to"),
         ((str(splat_run), "--upright", "--to", str(tmp_path / "a.ply"), "--data", "gone"), f"data of {splat_run}"),
     ):

@@ -1,6 +1,5 @@
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
@@ -8,10 +7,9 @@ from plyfile import PlyData
 from support.splat_cases import random_splats
 
 from padgs.apps.export import splat_file
-from padgs.apps.export.splat_file import estimate_seconds, read_splats, write_splats
+from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import write_ply
-from padgs.methods.splats.splats import Splats
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -67,14 +65,6 @@ def test_a_missing_converter_is_reported(tmp_path, generator, monkeypatch):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
 
 
-def test_conversion_times_are_estimated():
-    splats = Splats(*[torch.zeros(100_000, 3)] * 3, degree=2, scene_scale=1.0)
-    assert estimate_seconds(Path("a.sog"), splats) == 0, "no harmonics in use"
-    splats.active_degree = 2
-    assert 400 < estimate_seconds(Path("a.sog"), splats) == estimate_seconds(Path("a.html"), splats) < 550  # took 476
-    assert {estimate_seconds(Path(name), splats) for name in ("a.ply", "a.compressed.ply", "a.spz")} == {0}
-
-
 @pytest.mark.skipif(shutil.which(splat_file.CONVERTER) is None, reason="splat-transform is not installed")
 def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
     splats = random_splats(1, generator)
@@ -88,22 +78,28 @@ def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
     assert torch.allclose(back.log_scales[nearest.indices], splats.log_scales, atol=0.05)
 
 
-def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, monkeypatch):
-    script = "#!/bin/sh\nwhile [ $# -gt 2 ]; do [ $1 = --viewer-settings ] && found=$2; shift; done\ncp $found $2\n"
-    (tmp_path / splat_file.CONVERTER).write_text(script)
-    (tmp_path / splat_file.CONVERTER).chmod(0o755)
+@pytest.fixture
+def converter(tmp_path, monkeypatch):
+    """Return a function that installs a shell script as the converter."""
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+
+    def install(script: str) -> None:
+        (tmp_path / splat_file.CONVERTER).write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / splat_file.CONVERTER).chmod(0o755)
+
+    return install
+
+
+def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, converter):
+    converter("while [ $# -gt 2 ]; do [ $1 = --viewer-settings ] && found=$2; shift; done; cp $found $2")
     begin = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     write_splats(tmp_path / "a.html", random_splats(0, generator), start=begin)
     camera = json.loads((tmp_path / "a.html").read_text())["camera"]
     assert (camera["position"], camera["target"]) == ([-1, -2, 3], [-1, -2, 4]), "its y is up, and its x is left"
 
 
-def test_a_failing_converter_is_quoted_and_keeps_the_earlier_file(tmp_path, generator, monkeypatch):
-    script = "#!/bin/sh\nwhile [ $# -gt 1 ]; do shift; done\necho half >$1\necho no room left\nexit 3\n"
-    (tmp_path / splat_file.CONVERTER).write_text(script)
-    (tmp_path / splat_file.CONVERTER).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+def test_a_failing_converter_is_quoted_and_keeps_the_earlier_file(tmp_path, generator, converter):
+    converter("while [ $# -gt 1 ]; do shift; done; echo half >$1; echo no room left; exit 3")
     (tmp_path / "a.spz").write_text("the earlier one")
     with pytest.raises(ValueError, match="could not convert .* to .*a.spz: no room left"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))

@@ -1,14 +1,11 @@
-"""Runs in training: followed from checkpoint to checkpoint, and served by a child process."""
+"""Runs in training: followed from checkpoint to checkpoint."""
 
 import json
-import re
 import shutil
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -19,12 +16,9 @@ import padgs
 from padgs import results
 from padgs.apps.viewer import pages
 from padgs.apps.viewer.pages import show_runs
-from padgs.apps.viewer.process import serve_training, wait_for_checkpoint
 from padgs.apps.viewer.renders import RunRenderer, ViewOptions
-from padgs.apps.viewer.server import LOCAL, start_server
-from padgs.checks import install_command
+from padgs.apps.viewer.server import LOCAL, start_server, wait_for_checkpoint
 from padgs.runs import checkpoint
-from padgs.runs.config import WATCHED, RunOptions
 from padgs.runs.store import RunStore
 from padgs.training.model import State
 
@@ -54,7 +48,7 @@ def train_on(folder: Path) -> None:
     checkpoint.save(State(tensors, {**before.values, "progress": progress}), place, run)
 
 
-def test_training_is_followed_if_enabled(folder):
+def test_training_is_followed(folder):
     renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
     scene, pose = renderer.run.scene, renderer.run.scene.train[0].cam_from_world
 
@@ -67,21 +61,14 @@ def test_training_is_followed_if_enabled(folder):
     assert renderer.update() and "after 40 iterations" in renderer.summary
     assert not np.array_equal(image(), first)
     assert renderer.run.scene is scene, "the scene is not loaded again"
-    renderer.is_following = False
-    train_on(folder)
-    assert not renderer.update() and "after 40 iterations" in renderer.summary
-    renderer.is_following = True
-    assert renderer.update() and "after 50 iterations" in renderer.summary
     (folder / "checkpoint" / checkpoint.MANIFEST).write_text("{")
     assert renderer.update() and "cannot follow" in renderer.summary and not renderer.update()
-    assert "after 50 iterations" in renderer.summary and image().std() > 0, "what cannot be read changes no picture"
-    renderer.is_following = False
-    assert renderer.update() and "cannot follow" not in renderer.summary
+    assert "after 40 iterations" in renderer.summary and image().std() > 0, "what cannot be read changes no picture"
 
 
 def test_a_finished_run_is_not_followed(tmp_path_factory):
     renderer = RunRenderer(padgs.load_run(tiny_run(tmp_path_factory), device="cpu"))
-    assert not renderer.is_following and "iterations" not in renderer.summary
+    assert not renderer.update() and "iterations" not in renderer.summary
     renderer.stop()
     assert not renderer.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
 
@@ -101,7 +88,7 @@ def test_the_end_of_training_is_detected(folder, tmp_path_factory):
 def test_only_local_pages_can_stop_training(folder, host):
     run = padgs.load_run(folder, device="cpu")
     with start_server(host=host, port=8460) as server, show_runs(server, [run]), visiting(server.address) as visit:
-        visit.wait("document.body.innerText.includes('follow training')")
+        visit.wait("document.body.innerText.includes('pixels across')")
         if host != LOCAL:
             visit.page.wait_for_timeout(500)
             assert "stop and score" not in visit.page.inner_text("body")
@@ -161,38 +148,5 @@ def test_a_killed_run_without_checkpoint_is_refused(folder):
     shutil.rmtree(folder / "checkpoint")
     with pytest.raises(ValueError, match="no process trains it; start the same padgs-run again"):
         wait_for_checkpoint(folder)
-
-
-def test_a_failed_run_without_checkpoint_ends_waiting(folder):
-    shutil.rmtree(folder / "checkpoint")
     (folder / results.FILE_NAME).write_text("{}")
-    waiting = threading.Thread(target=wait_for_checkpoint, args=(folder,), daemon=True)
-    waiting.start()
-    waiting.join(30)
-    assert not waiting.is_alive()
-
-
-@WITH_VISER
-def test_a_run_is_served_while_it_trains(folder, capfd):
-    with serve_training(folder, None, "cpu"):
-        output, end = "", time.monotonic() + 60
-        while "http" not in output:
-            assert time.monotonic() < end, "no address was printed"
-            output += capfd.readouterr().out
-            time.sleep(0.1)
-        address = next(word for word in output.split() if word.startswith("http"))
-        assert b"<html" in urlopen(address, timeout=20).read()[:500]
-    with pytest.raises(OSError, match="refused"):
-        urlopen(address, timeout=5)
-
-
-def test_training_with_a_page_needs_viser(folder, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ValueError, match=re.escape(install_command("view"))), serve_training(folder, None, "cpu"):
-        raise AssertionError("it began")
-
-
-def test_viewing_shortens_the_checkpoint_interval():
-    assert RunOptions().seconds_between_checkpoints == 60
-    assert RunOptions(view=True).seconds_between_checkpoints == WATCHED
-    assert RunOptions(view=True, checkpoint_seconds=1).seconds_between_checkpoints == 1
+    wait_for_checkpoint(folder)  # it failed, and will have none

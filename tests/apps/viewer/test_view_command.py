@@ -10,15 +10,11 @@ import pytest
 from support.tiny_run import tiny_run
 from typer.testing import CliRunner
 
-from padgs.apps.viewer import pages, process
+from padgs.apps.viewer import pages
+from padgs.apps.viewer import server as process
 from padgs.cli.commands import app
 
 pytest.importorskip("viser", reason="the extra `view` is not installed")
-
-
-@pytest.fixture(autouse=True)
-def no_handlers(monkeypatch):
-    monkeypatch.setattr(process.signal, "signal", lambda *_: None)
 
 
 def test_runs_of_different_scenes_are_refused(tmp_path_factory):
@@ -35,14 +31,15 @@ def test_local_pages_are_opened_in_a_browser(monkeypatch, local, browse, opens):
     server = SimpleNamespace(address="http://here", is_local=local, viser=MagicMock())
     monkeypatch.setattr(process.webbrowser, "open", visited.append)
     monkeypatch.setattr(process, "start_server", lambda **_: nullcontext(server))
-    monkeypatch.setattr(process, "parent_is_alive", lambda: False)
+    monkeypatch.setattr(process.time, "sleep", MagicMock(side_effect=KeyboardInterrupt))
     monkeypatch.setattr(pages, "show_runs", lambda _, runs: nullcontext(shown.extend(runs)))
-    process.serve(lambda: [*visited, "a run"], browse=browse)
+    with pytest.raises(KeyboardInterrupt):
+        process.serve(lambda: [*visited, "a run"], browse=browse)
     assert shown == [*opens * ["http://here"], "a run"], "browsers load the page while the run is being opened"
 
 
 def test_the_page_is_served_before_torch_is_loaded():
-    code = "import sys, viser, padgs.cli.view, padgs.apps.viewer.process; sys.exit('torch' in sys.modules)"
+    code = "import sys, viser, padgs.cli.view, padgs.apps.viewer.server; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
