@@ -21,7 +21,7 @@ def check(
         str | None,
         typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none"),
     ] = None,
-    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
+    mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
     images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:

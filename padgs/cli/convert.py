@@ -21,7 +21,7 @@ def convert(
     points: Annotated[
         str, typer.Option(help="auto, random, or a PLY, LAS or E57 file in the source's folder")
     ] = "auto",
-    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
+    mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:
     """Write a data set in another format. Exit code 1, and nothing written, if that is impossible."""

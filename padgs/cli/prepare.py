@@ -32,7 +32,9 @@ def prepare(
         bool, typer.Option("--accurate", help="features in undistorted views; about 5x slower")
     ] = False,
     pairs: Annotated[str, typer.Option(help="auto, exhaustive, or sequential: names in the order taken")] = "auto",
-    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder; 255 = use")] = "auto",
+    mask: Annotated[
+        str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder; 255 = use")
+    ] = "auto",
     level: Annotated[bool, typer.Option(help="turn the world so that the cameras' common up is +z")] = True,
     per_second: Annotated[float, typer.Option(help="frames kept per second of video")] = 2.0,
     seed: Annotated[int, typer.Option(help="of all random choices")] = 0,

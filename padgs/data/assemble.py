@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
 from padgs.data.cloud import initial_cloud
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
-from padgs.data.masks import find_masks
+from padgs.data.masks import find_masks, masks_beside
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage
 from padgs.scene import Scene, View
@@ -97,10 +97,10 @@ def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_F
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the names of all images below a folder, as in `file_names`, without `a_mask.png` beside `a.jpg`."""
+    """Return the names of all images below a folder, as in `file_names`, without the masks beside them."""
     names = [name for name in file_names(folder) if name.lower().endswith(EXTENSIONS)]
-    masks = {f"{view_name(name)}_mask" for name in names}
-    return [name for name in names if view_name(name) not in masks]
+    masks = {mask.casefold() for name in names for mask in masks_beside(name)}
+    return [name for name in names if name.casefold() not in masks]
 
 
 def file_names(folder: Path) -> list[str]:

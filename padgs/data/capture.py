@@ -135,7 +135,7 @@ class DataSettings:
     width: int | None = None  # panoramas are reduced to this width by an area filter; None = as stored
     images: str | None = None  # image folder, relative to the data set's; None = search
     points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative to the data set's folder
-    mask: str = "auto"  # auto | none | rows:959/1024 (keep the first 959 of 1024) | a file, or a folder of files
+    mask: str = "auto"  # auto | none | inverted (255 = ignore) | rows:959/1024 | [inverted:] a file or folder
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
     test_every: int = 8  # k of split=every
     cache_bytes: int = 1 << 30  # memory for decoded images of all views

@@ -28,6 +28,7 @@ from padgs.data.conventions import (
     reprojection_errors,
 )
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
+from padgs.data.masks import MAX_HIDDEN
 from padgs.data.store import area_resize
 from padgs.geometry.panorama import project
 from padgs.scene import Scene, View, move_origin
@@ -36,7 +37,6 @@ OVERLAY = "check.png"  # default name, beside the data
 MAX_WIDTH = 2048  # of the overlay
 MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
 MIN_POINTS = 30  # whose colours are compared
-MAX_HIDDEN = 0.75  # share of an image that a sound mask hides at most: tripod, sky, what a part of a panorama lacks
 LEAK_DISTANCE = 0.01  # of the median depth: a test view nearer to a training view tests memory
 UNEVEN_EXPOSURE = 0.1  # standard deviation of the gains in doublings, from which learning exposures helps
 EXPOSURE_VIEWS = 40  # maximum number of views for measuring exposures
@@ -112,10 +112,11 @@ def check(
     report.median_depth = median_depth(poses, scene.points)
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     if hidden := [f"{name} ({share:.1%})" for name, share in report.masked.items() if share > MAX_HIDDEN]:
-        report.problems.append(
-            f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; in a "
-            "mask 255 means use, 0 means ignore: invert them, or set data.mask=none to do without"
+        text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; in a "
+        text += (
+            "mask 255 means use, 0 means ignore: repair them, or set data.mask (--mask) to none, inverted or a folder"
         )
+        (report.problems if options.mask == "auto" else report.notes).append(text)
     _check_leaks(scene, capture, report)
     if report.path_length == 0 and len(poses) > 1:
         report.problems.append("all cameras have the same centre; depth cannot be learned")

@@ -173,7 +173,9 @@ def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
         rows = (crop.top, crop.full_height - crop.top - crop.height)
         columns = (crop.left, crop.full_width - crop.left - crop.width)
         pixels = np.pad(pixels, (rows, columns, (0, 0))[: pixels.ndim])
-    return pixels if mode == "RGB" else pixels[..., None]
+    if mode == "RGB":
+        return pixels
+    return pixels[..., None] * np.uint8(255 if pixels.max() == 1 else 1)  # masks of 0 and 1
 
 
 def _is_transparent(image: Image.Image) -> bool:

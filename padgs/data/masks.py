@@ -1,20 +1,23 @@
 """Masks: weights of pixels, 255 = use, 0 = ignore. Images themselves are never blackened.
 
 A mask is one file for the scene, one file per image, the rule that only the first rows count, or their product.
+`data.mask=inverted` (or inverted:FOLDER) reads files in which 255 marks what to ignore.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from statistics import median
 from unicodedata import normalize
 
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture, DataError
+from padgs.data.capture import Capture, DataError, listed
 from padgs.data.image_metadata import Crop
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
@@ -23,7 +26,10 @@ from padgs.geometry.distortion import solid_angle_weight
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
 MASK_FOLDERS = ("masks", "mask")
 MIN_VISIBLE = 0.01  # of the sphere; with less, training has no signal and metrics are undefined
+MAX_HIDDEN = 0.75  # share of the sphere that a sound mask hides at most: tripod, sky, what a part of a panorama lacks
+INVERTED = "dynamic_mask_"  # begins the names of instant-ngp's masks, in which 255 marks what to ignore
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
+_INVERT = "If white marks what to ignore in them, set data.mask=inverted"
 
 
 @dataclass(frozen=True)
@@ -32,13 +38,15 @@ class Mask:
 
     file: StoredImage | None
     fixed: Tensor | None  # [H, W or 1] float32, of `rows:` and of crops
+    inverted: bool = False  # whether 255 means ignore in the file
 
     def __call__(self) -> Tensor:
         """Return weights [H, W] float32 in [0, 1]."""
         weight = None if self.file is None else self.file()[..., 0].float() / 255
         if self.fixed is None:
             assert weight is not None
-            return weight
+            return 1 - weight if self.inverted else weight
+        weight = 1 - weight if weight is not None and self.inverted else weight
         fixed = self.fixed if weight is None else self.fixed.to(weight.device)
         return fixed.expand(-1, 2 * len(fixed)).clone() if weight is None else weight * fixed
 
@@ -78,12 +86,18 @@ def find_masks(
         store: caches decoded masks.
 
     Raises:
-        DataError: a mask differs in size from its image, shows less than `MIN_VISIBLE`, or has transparent pixels; or
-            `spec` is invalid.
+        DataError: a mask differs in size from its image, shows less than `MIN_VISIBLE`, or has transparent pixels;
+            masks that `spec` does not name hide more than `MAX_HIDDEN`, as inverted ones do; or `spec` is invalid.
     """
     spec = capture.mask if spec == "auto" else spec
+    inverted, given = spec == "inverted" or spec.startswith("inverted:"), spec
+    spec = (spec.removeprefix("inverted").removeprefix(":") or "auto") if inverted else spec
     rule = _ROWS.fullmatch(spec)
     files, note = ({}, None) if spec == "none" else _mask_files(capture, mask_path(spec, capture.folder))
+    if inverted and not files:
+        raise DataError(
+            f"data.mask={given}: there are no mask files to invert; put them into {capture.folder / 'masks'}"
+        )
     notes = [note] if note else []
     rows: dict[int, Tensor] = {}  # by height
     if rule:
@@ -97,7 +111,7 @@ def find_masks(
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
-    checked: set[StoredImage | None] = set()
+    shown: dict[StoredImage | None, float] = {}  # share of the sphere
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
         path, fixed = files.get(frame.name), rows.get(height)
         if image.crop is not None:
@@ -114,12 +128,21 @@ def find_masks(
                 f"{path} is {mask_file.width}x{mask_file.height} but {image.path.name} is "
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
-        mask = Mask(StoredImage(path, width, height, store, "L"), fixed)
-        if mask.file not in checked:
-            _refuse_hidden(mask(), f"{path} hides {{}} of {frame.name}; in a mask 255 means use, 0 means ignore")
-        checked.add(mask.file)
+        mask = Mask(StoredImage(path, width, height, store, "L"), fixed, inverted ^ path.name.startswith(INVERTED))
+        if mask.file not in shown:
+            hides = f"{path} hides {{}} of {frame.name}; in a mask 255 means use, 0 means ignore; {_INVERT}"
+            shown[mask.file] = _refuse_hidden(mask(), hides)
         masks.append(mask)
-        digests.append(f"{frame.name}:{mask_file.digest}")
+        digests.append(f"{frame.name}:{mask_file.digest}{':inverted' * mask.inverted}")
+    if (median(shown.values()) if shown else 1) < 1 - MAX_HIDDEN:
+        hides = f"the masks hide {1 - median(shown.values()):.0%} of the sphere"
+        if given == "auto":
+            where = os.path.relpath(next(iter(inspected)), capture.folder).split(os.sep)[0]
+            raise DataError(
+                f"{hides}, in {listed(path.name for path in inspected)}; in a mask 255 means use, 0 means ignore. "
+                f"{_INVERT}; if that is meant, set data.mask={where}"
+            )
+        notes.append(f"{hides}, as data.mask={given} says")
     return masks, digests, notes
 
 
@@ -131,7 +154,7 @@ def mask_path(spec: str, folder: Path) -> Path | None:
     Raises:
         DataError: both exist and differ.
     """
-    if spec in ("auto", "none") or _ROWS.fullmatch(spec):
+    if spec in ("auto", "none", "inverted") or _ROWS.fullmatch(spec):
         return None
     inside, given = folder / spec, Path(spec).absolute()
     if not given.exists():
@@ -141,20 +164,23 @@ def mask_path(spec: str, folder: Path) -> Path | None:
     return given
 
 
-def _refuse_hidden(weights: Tensor, message: str) -> None:
-    """Refuse weights [H, W or 1] that show less than `MIN_VISIBLE` of the sphere."""
+def _refuse_hidden(weights: Tensor, message: str) -> float:
+    """Return the share of the sphere that weights [H, W or 1] show; refuse less than `MIN_VISIBLE`."""
     area = solid_angle_weight(len(weights))
     # The mean weight, not the share of non-zero pixels: a mask with 1 in place of 255 hides nearly everything.
     shown = (weights.mean(-1).cpu() @ area / area.sum()).item()
     if shown < MIN_VISIBLE:
         much = f"all but {shown:.2%} of the sphere" if shown else "every pixel"
         raise DataError(message.format(much))
+    return shown
 
 
 def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], str | None]:
     """Map frame names to mask files (one for all, a folder of files, or files that the format names); and a note."""
     if given is not None and not given.exists():
-        raise DataError(f"data.mask={given}: there is no such file or folder; keywords: auto, none, rows:959/1024")
+        raise DataError(
+            f"data.mask={given}: there is no such file or folder; keywords: auto, none, inverted, rows:959/1024"
+        )
     named = {frame.name: frame.mask for frame in capture.frames if frame.mask is not None}
     if given is None and named:
         absent = [path for path in named.values() if not path.is_file()]
@@ -169,8 +195,8 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         given = next(iter(usual), capture.image_folder)
     if given.is_file():
         return {frame.name: given for frame in capture.frames}, f"mask: {given.name} for every view"
-    beside = given == capture.image_folder
-    found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside))}
+    beside, listings = given == capture.image_folder, {}
+    found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside, listings))}
     if beside and not found:
         return {}, None
     if not found:
@@ -178,18 +204,33 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
             f"{given} holds no mask named like an image (such as {capture.frames[0].name}.png); rename them, or set "
             "data.mask=none"
         )
-    return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views"
+    turned = " (white is ignored)" if any(path.name.startswith(INVERTED) for path in found.values()) else ""
+    return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views{turned}"
 
 
-def _in_folder(folder: Path, name: str, beside_images: bool) -> Path | None:
-    """Return the mask of image `a.jpg`: `a.jpg.png` (COLMAP's convention), `a.png`, another image named `a`, or
-    `a_mask.png`, the only one that may be beside the image.
+def masks_beside(name: str) -> list[str]:
+    """Return the names that a mask may have beside its image, or in a folder of masks.
+
+    >>> masks_beside("hall/a.jpg")[::7]
+    ['hall/a.jpg.png', 'hall/a_mask.bmp']
     """
     stem = PurePosixPath(name).with_suffix("")
-    candidates = [f"{name}.png", *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
-    candidates = [*([] if beside_images else candidates), *(f"{stem}_mask{extension}" for extension in EXTENSIONS)]
-    forms = (folder / normalize(form, file) for file in candidates for form in ("NFC", "NFD"))
-    return next((file for file in (*(folder / file for file in candidates), *forms) if file.is_file()), None)
+    names = [f"{name}.png", *(f"{stem}_mask{extension}" for extension in EXTENSIONS)]
+    return [*names, str(stem.with_name(f"{INVERTED}{stem.name}.png"))]
+
+
+def _in_folder(folder: Path, name: str, beside: bool, listings: dict[Path, dict[str, Path]]) -> Path | None:
+    """Return the mask of an image in a folder, in any case and Unicode form; `listings` caches what folders hold."""
+    stem = PurePosixPath(name).with_suffix("")
+    first, *others = masks_beside(name)
+    for candidate in [first, *([] if beside else [f"{stem}{end}" for end in (".png", *EXTENSIONS)]), *others]:
+        parent = (folder / candidate).parent
+        if parent not in listings:
+            files = [file for file in parent.iterdir() if file.is_file()] if parent.is_dir() else []
+            listings[parent] = {normalize("NFC", file.name).casefold(): file for file in files}
+        if file := listings[parent].get(normalize("NFC", PurePosixPath(candidate).name).casefold()):
+            return file
+    return None
 
 
 def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:

@@ -85,7 +85,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "images.bin ends early"),
     "masks inverted": (
         lambda f: _save(f, "mask.png", np.pad(np.full((3, 64), 255, np.uint8), ((29, 0), (0, 0)))),
-        r"the masks of 6 views hide more than 75% of the image: pano_00 \(90.6%\), .*; in a mask 255 means use",
+.*, set data.mask=inverted; if ",
     ),
     "images of another place": (
         lambda f: _shuffle_colours(f),

@@ -45,24 +45,47 @@ def test_one_mask_for_the_scene(folder: Path) -> None:
     assert load(folder, mask="none").train[0].mask() is None
 
 
-@pytest.mark.parametrize("spelling", ["{}.png", "{}.png.png", "{}.bmp"])
-def test_masks_per_image(spelling: str, folder: Path) -> None:
-    _mask(folder / "masks" / spelling.format("pano_00"), hidden_rows=16)
-    views = {view.name: view for view in load(folder).train}
-    assert views["pano_00"].mask().mean() == 0.5
-    assert views["pano_02"].mask() is None
-
-
-def test_folder_mask_and_masks_beside_images_are_used(folder: Path) -> None:
-    _mask(folder / "images" / "pano_02_mask.png", hidden_rows=16)
+@pytest.mark.parametrize(
+    "file",
+    [f"{folder}/{name}" for folder in ("masks", "mask") for name in ("pano_00.png", "pano_00.png.png", "PANO_00.BMP")]
+    + [
+        "masks/pano_00_mask.jpg",
+        "images/pano_00_mask.png",
+        "images/pano_00.png.png",
+        "images/dynamic_mask_pano_00.png",
+    ],
+)
+def test_habits_of_other_programs(file: str, folder: Path) -> None:
+    _mask(folder / file, hidden_rows=12)
     scene = load(folder)
     views = {view.name: view for view in (*scene.train, *scene.test)}
-    assert views["pano_02"].mask().mean() == 0.5 and views["pano_00"].mask() is None
-    assert "masks: images/ for 1 of 6 views" in scene.notes and len(views) == 6
+    hidden = 20 if "dynamic" in file else 12  # white is ignored there
+    torch.testing.assert_close(views["pano_00"].mask().sum(), torch.tensor((32.0 - hidden) * 64), atol=9, rtol=0)
+    assert views["pano_02"].mask() is None and len(views) == 6
+    assert any(note.startswith(f"masks: {file.split('/')[0]}/ for 1 of 6 views") for note in scene.notes)
     assert not any("no pose" in note for note in scene.notes)
-    _mask(folder / "mask" / "pano_00.png.png", hidden_rows=16)
-    scene = load(folder)
-    assert scene.train[0].mask().mean() == 0.5 and "masks: mask/ for 1 of 6 views" in scene.notes
+
+
+def test_inverted_masks_are_asked_about_and_inverted(folder: Path) -> None:
+    plain = load(folder).fingerprint
+    for i, name in enumerate(("pano_00", "pano_01", "pano_02")):
+        _mask(folder / "masks" / f"{name}.png", hidden_rows=26 + i)
+    question = (
+        "the masks hide 9.% of the sphere, in pano_00.png, .* set data.mask=inverted; if that is meant, set data.m"
+    )
+    with pytest.raises(DataError, match=f"{question}ask=masks"):
+        load(folder)
+    shown = [load(folder, mask=spec).train[0].mask().mean().item() for spec in ("masks", "inverted", "inverted:masks")]
+    assert shown == [6 / 32, 26 / 32, 26 / 32]
+    assert "the masks hide 94% of the sphere, as data.mask=masks says" in load(folder, mask="masks").notes
+    assert len({plain, *(load(folder, mask=spec).fingerprint for spec in ("masks", "inverted"))}) == 3
+    with pytest.raises(DataError, match="data.mask=inverted:none: there are no mask files to invert"):
+        load(folder, mask="inverted:none")
+
+
+def test_masks_of_zeros_and_ones(folder: Path) -> None:
+    Image.fromarray((np.arange(32 * 64).reshape(32, 64) < 1024).astype(np.uint8)).save(folder / "mask.png")
+    assert load(folder).train[0].mask().mean() == 0.5
 
 
 def test_grey_values_are_weights_and_rows_multiply(folder: Path) -> None:
@@ -96,9 +119,6 @@ def test_masks_that_hide_almost_everything_are_refused(folder: Path) -> None:
         load(folder, mask="pixel.png")
     with pytest.raises(DataError, match=r"data.mask=rows:1/32 hides all but 0.24% of the sphere of each image; keep"):
         load(folder, mask="rows:1/32")
-    Image.fromarray(np.ones((32, 64), np.uint8)).save(folder / "ones.png")
-    with pytest.raises(DataError, match=r"ones.png hides all but 0.39% of the sphere of pano_00.png; in a mask 255"):
-        load(folder, mask="ones.png")
 
 
 def test_masks_relative_to_the_working_directory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +158,9 @@ def test_unusable_masks(folder: Path) -> None:
     _mask(folder / "mask.png", hidden_rows=32)
     with pytest.raises(DataError, match=r"mask.png hides every pixel of pano_00.png; in a mask 255 means use"):
         load(folder)
-    with pytest.raises(DataError, match="absent.png: there is no such file or folder; keywords: auto, none, rows"):
+    with pytest.raises(
+        DataError, match="absent.png: there is no such file or folder; keywords: auto, none, inverted, rows"
+    ):
         load(folder, mask="absent.png")
     with pytest.raises(DataError, match="rows:40/32: the first number"):
         load(folder, mask="rows:40/32")
