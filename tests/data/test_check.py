@@ -85,7 +85,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "images.bin ends early"),
     "masks inverted": (
         lambda f: _save(f, "mask.png", np.pad(np.full((3, 64), 255, np.uint8), ((29, 0), (0, 0)))),
-.*, set data.mask=inverted; if ",
+        "the masks hide 98% of the sphere, in mask.png; .* white marks what to ignore .*, set data.mask=inverted; if ",
     ),
     "images of another place": (
         lambda f: _shuffle_colours(f),
