@@ -31,6 +31,7 @@ STATUSES = {
     "rejected": "the input was refused with a clear error",
 }
 STOP_REQUESTED = "asked to stop and score"  # `ended` of a run stopped by the user, which is no repeat of a full run
+EXTERNAL = ("program", "version", "label")  # keys of Result.external; program and version may be empty
 AD_HOC = "ad_hoc"  # in `experiments`: the run was also requested without an experiment
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # word in the name of a metric
 SMALLEST_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB; `padgs smallest` finds the smallest model for each
@@ -80,6 +81,8 @@ class Result:
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
     experiments: tuple[str, ...] = ()  # experiments and sweeps of the run, sorted; see `joined`
     smallest: dict[str, Any] = field(default_factory=dict)  # see `padgs.runs.smallest.Search.front`
+    # EXTERNAL -> text, if another program made the model or its renders (`padgs score`); the method is "external" then
+    external: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Reject a status that is not in STATUSES."""
@@ -203,6 +206,8 @@ def file_content(path: Path) -> bytes:
 def encoded(result: Result) -> dict[str, Any]:
     """Return a result as the document of its file: schema version, digest, and all fields."""
     content = _encode(asdict(result))
+    if not result.external:
+        del content["external"]
     return {"schema": SCHEMA, "sha256": _digest(content), **content}
 
 
@@ -273,7 +278,9 @@ def _refuse_impossible(result: Result) -> None:
     for name, value in result.timing.items():
         if value < 0:
             raise ValueError(f"timing.{name} is {value}; it must be a time, at least 0")
-    names = [*vars(result).values(), *(view for scores in result.scores.values() for view in scores.views)]
+    if result.external.keys() - EXTERNAL or not all(isinstance(text, str) for text in result.external.values()):
+        raise TypeError(f"external is {result.external!r}; it must be texts named {', '.join(EXTERNAL)}")
+    names = [*vars(result).values(), *result.external.values(), *(view for scores in result.scores.values() for view in scores.views)]
     for name in names:
         if isinstance(name, str) and name != result.reason and len(name) > LONGEST_NAME:
             raise ValueError(f"{name[:20]}... has {len(name)} letters; names have at most {LONGEST_NAME}")
