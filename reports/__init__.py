@@ -45,7 +45,7 @@ REPORTS: Mapping[str, Report] = {
     "stability": Report("padgs.reports.robustness:stability", ("stress",)),
     "limits": Report("padgs.reports.robustness:limits", ("stress",)),
     "smallest": Report("padgs.reports.smallest:table", ("smallest",)),
-    "smallest_chart": Report("padgs.reports.charts.smallest_chart:charts", ("smallest",)),
+    "smallest_chart": Report("padgs.reports.smallest:charts", ("smallest",)),
     "chart": Report("padgs.reports.charts.trade_off_chart:charts", ("pareto", *QUALITY_ORDER, *ALL_METHODS)),
     "equal_time_chart": Report("padgs.reports.charts.trade_off_chart:equal_time_charts", ("equal_time",)),
     "gallery": Report("padgs.reports.charts.gallery:charts", ("equal_time", *QUALITY_ORDER, *ALL_METHODS)),

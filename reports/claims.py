@@ -21,7 +21,7 @@ from padgs.reports.published import DATASETS, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import CONFIDENCE
 from padgs.reports.table import MISSING
-from padgs.reports.writers import Page, markdown_text
+from padgs.reports.writers import Page, rendered
 from padgs.results import higher_is_better
 
 HOLDS, FAILS, MIXED = "holds", "does not hold", "depends on the scene"
@@ -200,56 +200,21 @@ def findings(run_set: RunSet) -> Page:
         ReportError: runs must not be compared, or are mixed in a cell.
     """
     numbers, tested = published.load(), judge(load(), run_set)
-    parts = ["# Findings", _answer(tested), "## Evidence", _table(tested, numbers), "## Scenes", _scenes(tested)]
-    return Page("findings.md", "\n\n".join([*parts, "## Rules", RULES.strip()]) + "\n")
-
-
-def _answer(tested: Sequence[Evidence]) -> str:
     paper = [one.verdict for one in tested if one.claim.source != OURS]
-    failed = sum(verdict.startswith((NOT_REPRODUCED, FAILS)) for verdict in paper)
-    first = f"Of {len(paper)} claims of the paper, {paper.count(HOLDS)} hold in the runs of this project and {failed} "
-    first += "do not; the rest depend on the scene, are undecided or were not measured."
-    lines = []
-    for verdict in dict.fromkeys((HOLDS, *sorted(one.verdict for one in tested))):
-        claims = [one.claim for one in tested if one.verdict == verdict]
-        texts = [" ".join(filter(None, (f"- {claim.text} ({claim.source}).", claim.note))) for claim in claims]
-        lines += [f"**{verdict.capitalize()}:**\n\n" + "\n".join(texts)] if texts else []
-    return "\n\n".join([first, *lines])
-
-
-def _table(tested: Sequence[Evidence], numbers: Mapping[Key, Published]) -> str:
-    lines = [
-        "| claim | source | number | advantage | interval | p | ahead on | strongest rivals | in the paper | verdict |",
-        "| --- | --- | --- | ---: | ---: | ---: | ---: | --- | --- | --- |",
-    ]
-    for one in tested:
-        claim, scenes = one.claim, one.tested
-        cells = [claim.text, claim.source, claim.measure.column.title, *[MISSING] * 5]
-        if len(scenes):
-            cells[3] = claim.show(scenes["advantage"].mean())
-            cells[6] = f"{(scenes['advantage'] > 0).sum()} of {len(scenes)} scenes"
-            cells[7] = "; ".join(scenes["rival"].unique())
-        if one.interval:
-            cells[4], cells[5] = " to ".join(map(claim.show, one.interval)), f"{one.p:.2g}"
-        paper = in_the_paper(claim, numbers)
-        cells.append("<br>".join(f"{where}: {claim.show(value)}" for where, value in paper.items()) or MISSING)
-        lines.append(_line([*cells, one.verdict]))
-    return "\n".join(lines)
-
-
-def _scenes(tested: Sequence[Evidence]) -> str:
-    lines = ["| claim | scene | size, length | seeds: ours, rival | rival | advantage |"]
-    lines.append("| --- | --- | --- | ---: | --- | ---: |")
-    for one in tested:
-        for row in one.scenes.to_dict("records"):
-            shown = one.claim.show(row["advantage"]) + ("" if row["tested"] else " (not tested)")
-            size = f"{row['size']}, {row['length']}"
-            lines.append(_line([one.claim.text, row["scene"], size, row["seeds"], row["rival"], shown]))
-    return "\n".join(lines)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell if '<br>' in cell else markdown_text(cell) for cell in cells)} |"
+    every = dict.fromkeys([HOLDS, *sorted(one.verdict for one in tested)])
+    verdicts = {verdict: [one.claim for one in tested if one.verdict == verdict] for verdict in every}
+    text = rendered(
+        "findings.md.j2",
+        paper=paper,
+        holding=paper.count(HOLDS),
+        failing=sum(verdict.startswith((NOT_REPRODUCED, FAILS)) for verdict in paper),
+        verdicts={verdict: claims for verdict, claims in verdicts.items() if claims},
+        evidence=[(one, in_the_paper(one.claim, numbers)) for one in tested],
+        missing=MISSING,
+        least_seeds=LEAST_SEEDS,
+        confidence=CONFIDENCE,
+    )
+    return Page("findings.md", text)
 
 
 def measured(claim: Claim, run_set: RunSet) -> DataFrame:
@@ -305,23 +270,3 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, 
 def _numbers(claim: Claim, runs: DataFrame) -> Any:
     """Return the numbers of successful runs."""
     return runs.loc[runs["ok"]].reindex(columns=[claim.metric])[claim.metric].dropna().astype(float)
-
-
-RULES = f"""
-`padgs report findings RUNS --out docs` makes this page from runs, for the project itself from
-`reports/measured/results.jsonl`, and the claims in `reports/claims.yaml`.
-
-An advantage is the difference of the favoured side's mean over seeds from the best of the others, or for costs the
-ratio (×); it is positive, or above 1, where the claim is right. Each scene counts once: with the widest, then the
-longest runs that both sides have with at least {LEAST_SEEDS} seeds. A scene with fewer seeds of a side, or without a
-rival that the claim requires, is listed but not tested. The test is a paired t-test over scenes
-(`scipy.stats.ttest_rel`); the interval has a confidence of {CONFIDENCE:.0%}, and p is corrected for all claims (Holm).
-
-A claim *holds* if p is below {1 - CONFIDENCE:.2g} and every scene is on its side. If they are on the other, it
-*does not hold* at the paper's size and length, and is *not reproduced* at others. It *depends on the
-scene* if scenes disagree, and is *undecided* without significance. Claims of the paper are judged against the paper's
-methods as published.
-
-All methods train with learning rates that fit the length of a run (`train.learning_rates=run`), OmniGS and OP43DGS by
-a law of their own ([table](../reports/measured/learning_rates.md)); ODGS was not measured.
-"""

@@ -1,4 +1,4 @@
-"""Robustness of methods under stress (`+experiment=stress`): tables `stability` and `limits`.
+"""Robustness of methods under stress (`+experiment=stress`): tables `stability` and `limits`, and a heat map.
 
 The robustness under a condition is (Q - Q1) / (Q0 - Q1_0) within [0, 1]. Q is WS-PSNR of the protocol `stability`, Q1
 that of one colour for the whole image, and Q0 and Q1_0 are those of the same run without the condition. A failed run
@@ -19,7 +19,7 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports import methods
-from padgs.reports.charts.drawing import Chart
+from padgs.reports.charts.drawing import Chart, figure, lay_out, styled
 from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import CONFIG, by_conditions, grouped
 from padgs.reports.selection import RunSet, one_setting, refuse_differences
@@ -37,6 +37,15 @@ HALF = 0.5  # a condition breaks a method below this robustness
 LIMITS_ARE_FOR = ("256x128", 1500)  # resolution, and iterations without stress
 BEYOND = "beyond"
 UNITS = {"seam": "seam", "depth_error": "depth error", "ws_psnr_fitted": "dB after a fit of colours", "ws_psnr": "dB"}
+STATUS_LETTERS = {
+    **{"oom": "M", "timeout": "T", "nan": "N", "diverged": "V", "collapsed": "C"},
+    **{"exploded": "E", "degenerate": "D", "silent": "S", "rejected": "R"},
+}
+COLORS = "cividis"  # dark where nothing is left; readable for colour-blind readers
+LIGHT, DARK = "#fafafa", "#101010"  # numbers on dark and on bright cells
+SHOWN_LEVEL = 2  # of stress, in the heat map; 1 is mild, 3 is severe
+WIDTH, HEIGHT, BORDER = 0.8, 0.34, (1.8, 1.9)  # inches of a cell, and beside and above all cells
+NARROWEST, WIDEST = 5.2, 13.5  # inches of a heat map; 1500 pixels at most
 UNSTRESSED = {  # title -> column of the frame, and columns that are subtracted from it
     "WS-PSNR, dB": (QUALITY,),
     "training views above test views, dB": (f"{PROTOCOL}/ws_psnr_training", QUALITY),
@@ -176,13 +185,11 @@ def all_stress(stressed: Sequence[StressedMethod]) -> list[Stress]:
 
 
 def stability(run_set: RunSet) -> list[Table | Chart]:
-    """Return a table with three blocks for each scene, and for each a heat map and a chart of robustness over time.
+    """Return a table with three blocks for each scene, and a heat map for each.
 
     Raises:
         ReportError: runs must not be compared, or are mixed in a cell.
     """
-    from padgs.reports.charts.robustness_chart import heat_map, speed_and_accuracy  # they import this module
-
     found = stressed_methods(run_set)
     presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
     blocks = []
@@ -208,7 +215,7 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
     columns = tuple(Column(methods.title(preset), 2) for preset in presets)
     notes = (*footnotes(_references(run_set, found), PROTOCOL), *STABILITY_NOTES)
     table = Table("stability", "Robustness of methods under stress", "Condition", columns, tuple(blocks), notes)
-    return [table, *(draw(*one) for one in found.items() for draw in (heat_map, speed_and_accuracy))]
+    return [table, *(heat_map(*one) for one in found.items())]
 
 
 def limits(run_set: RunSet) -> Table:
@@ -238,6 +245,51 @@ def limits(run_set: RunSet) -> Table:
     return Table(
         "limits", "Losses of methods under stress, and their limits", "Condition", columns, tuple(blocks), notes
     )
+
+
+@styled
+def heat_map(title: str, stressed: Sequence[StressedMethod]) -> Chart:
+    """Return a row per condition at `SHOWN_LEVEL` and a column per method that was run under all of them.
+
+    Robustness is shown as colour, failures as letters. Without a run at that level, the mildest one is shown; if no
+    method is complete, all are.
+    """
+    import matplotlib
+
+    levels = {level for _, level in all_stress(stressed)}
+    level = SHOWN_LEVEL if SHOWN_LEVEL in levels else min(levels)
+    stresses = [stress for stress in all_stress(stressed) if stress[1] == level]
+    complete = [one for one in stressed if not {*stresses} & one.missing]
+    shown = complete or [one for one in stressed if {*stresses} & one.runs.keys()]
+    width = min(WIDTH, (WIDEST - BORDER[0]) / len(shown))
+    made, axes = figure(1, 1, max(BORDER[0] + width * len(shown), NARROWEST), BORDER[1] + HEIGHT * len(stresses))
+    panel, statuses = axes[0, 0], set[str]()
+    for row, stress in enumerate(stresses):
+        for column, one in enumerate(shown):
+            if (cell := one.robustness.get(stress)) is not None:
+                value = cell.value or 0.0
+                statuses |= {*cell.status.split()}
+                color, corners = matplotlib.colormaps[COLORS](value), ([column + 0.03, column + 0.97], row + 0.04)
+                panel.fill_between(*corners, row + 0.96, color=color, linewidth=0)
+                letters = "".join(STATUS_LETTERS[status] for status in cell.status.split())
+                look = {"color": DARK if value > 0.55 else LIGHT, "fontweight": "bold" if letters else "normal"}
+                text = letters or f"{value:.2f}".lstrip("0")
+                panel.text(column + 0.5, row + 0.5, text, ha="center", va="center_baseline", fontsize=10, **look)
+    titles = [methods.short(methods.title(one.preset), one.preset) for one in shown]
+    panel.set(xlim=(0, len(shown)), ylim=(len(stresses), 0))
+    panel.set_xticks([n + 0.5 for n in range(len(shown))], titles, rotation=40, ha="left")
+    panel.xaxis.tick_top()
+    panel.set_yticks([n + 0.5 for n in range(len(stresses))], [name for name, _ in stresses])
+    panel.tick_params(length=0)
+    panel.grid(False)
+    panel.spines[:].set_visible(False)
+    known = [f"{letter} {status}" for status, letter in STATUS_LETTERS.items() if status in statuses]
+    panel.set_xlabel("; ".join(["1: keeps everything, 0: one colour", *([", ".join(known)] if known else [])]))
+    lay_out(made, f"What methods keep under stress of level {level}\n{title}")
+    notes = ["Each cell: the distance to one colour, as a share of the method's own without stress."]
+    if left_out := [methods.title(one.preset) for one in stressed if one not in shown]:
+        notes.append(f"Not run under all conditions, and so left out: {', '.join(left_out)}.")
+    return Chart(f"stability-{stressed[0].place}", title, made, tuple(notes))
 
 
 def _row_maker(presets: Sequence[str], stressed: Sequence[StressedMethod]) -> Callable[..., Row]:

@@ -1,8 +1,9 @@
-"""Smallest models of a quality (`padgs smallest`): curves of quality over size, and the table `smallest`."""
+"""Smallest models of a quality (`padgs smallest`): a table, and charts of quality over Gaussians, bytes and time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,34 @@ from typing import Any
 import numpy as np
 from pandas import DataFrame
 
+from padgs.reports.charts.drawing import (
+    INK,
+    MARKERS,
+    Chart,
+    color_of,
+    figure,
+    lay_out,
+    set_axis,
+    show_image,
+    spans,
+    styled,
+)
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet, settings
 from padgs.reports.significance import mean_cell
+from padgs.reports.store import split_image
 from padgs.reports.table import Block, Cell, Column, Row, Table
-from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_STATED
+from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, SMALLEST_STATED, file_name
 
 STATED = f"{SMALLEST_STATED:g}"  # dB, as results name losses
+PANELS = (
+    ("blended", "Gaussians blended", 1.0),
+    ("bytes", "model, MB", 1e-6),
+    ("frame_ms", "minimal ms per frame", 1.0),
+)
+LOSSES = tuple(f"{loss:g}" for loss in SMALLEST_PICTURED)  # dB, marked in the chart by a ring and a square
+LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic
 NOTES = (
     "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
     "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
@@ -25,8 +46,7 @@ NOTES = (
     "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
     "At least: the smallest model that is not known to lose more, with 95 % confidence; the interval of the minimal "
     "count begins there. By test views: the smallest model that loses no more on the test views.",
-    "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
-    "curves share.",
+    "Knee: the largest model below which a halving costs more than 0.1 dB.",
 )
 
 
@@ -37,7 +57,6 @@ class Curve:
     title: str  # of the method, with its setting, and the seed if there are several
     method: str  # the same without the seed
     preset: str
-    seed: int
     found: Mapping[str, Any]  # `Result.smallest`
     image: Path | None = None  # see `padgs.results.SMALLEST_PICTURE`
 
@@ -86,7 +105,7 @@ def curves(runs: DataFrame) -> list[Curve]:
             title = setting.title + (f", seed {run['seed']}" if several else "")
             image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
             image = image if image is not None and image.is_file() else None
-            found.append(Curve(title, setting.title, setting.preset, int(run["seed"]), run["smallest"], image))
+            found.append(Curve(title, setting.title, setting.preset, run["smallest"], image))
     return found
 
 
@@ -96,60 +115,31 @@ def by_method(found: Sequence[Curve]) -> dict[str, list[Curve]]:
     return {method: [one for one in found if one.method == method] for method in methods}
 
 
-def gain(ours: Curve, other: Curve) -> float | None:
-    """Return the mean difference of quality at equal numbers of Gaussians, dB; None where the curves share none.
+def _count(step: Callable[[Mapping[str, Any]], int | None]) -> Callable[[Curve], float | None]:
+    """Return the count of a candidate that `padgs smallest` names; None in results that name none."""
 
-    Both are interpolated linearly over log2 N (the difference of Bjontegaard, without his cubic).
-    """
-    return _mean_difference(*(_points(curve.values("blended"), curve.quality) for curve in (ours, other)))
-
-
-def ratio(ours: Curve, other: Curve) -> float | None:
-    """Return the geometric mean ratio of numbers of Gaussians at equal quality; None where the curves share none.
-
-    Where more Gaussians are no better, the smaller number counts.
-    """
-    points = []
-    for curve in (ours, other):
-        sizes, qualities = _points(curve.values("blended"), curve.quality)
-        best = np.maximum.accumulate(qualities)
-        first = np.concatenate(([True], np.diff(best) > 0))
-        points.append((best[first], sizes[first]))
-    difference = _mean_difference(*points)
-    return None if difference is None else 2.0**difference
-
-
-def _knee(own: Curve, _: Curve) -> float | None:
-    return None if own.found["knee"] is None else own.found["steps"][own.found["knee"]]["blended"]
-
-
-def _count(name: str) -> Callable[[Curve, Curve], float | None]:
-    """Return the count of a candidate that `padgs smallest` names for the stated loss; None in results without it."""
-
-    def count(own: Curve, _: Curve) -> float | None:
-        number = own.found.get(name, {}).get(STATED)
+    def count(own: Curve) -> float | None:
+        number = step(own.found)
         return None if number is None else own.found["steps"][number]["blended"]
 
     return count
 
 
-COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
-    Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],
+COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
+    Column("Gaussians blended", 0): lambda own: own.found["steps"][0]["blended"],
     **{
-        Column(f"minimal count for {loss:g} dB", 0, False): lambda own, _, e=f"{loss:g}": own.smallest[e]["blended"]
+        Column(f"minimal count for {loss:g} dB", 0, False): lambda own, e=f"{loss:g}": own.smallest[e]["blended"]
         for loss in SMALLEST_LOSSES
     },
-    Column(f"at least, for {STATED} dB", 0): _count("possible"),
-    Column(f"by test views, for {STATED} dB", 0): _count("by_test"),
-    Column(f"share for {STATED} dB", 2): lambda own, _: own.smallest[STATED]["rows"] / own.found["rows"],
-    Column("knee", 0): _knee,
-    Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.smallest[STATED]["bytes"] / 1e6,
-    Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own, _: own.smallest[STATED]["frame_ms"],
-    Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.smallest[STATED]),
-    Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
-    Column("dB at equal N against the first", 2, signed=True): gain,
-    Column("N at equal dB over the first's", 2): ratio,
-    Column("CPU s of the search", 0): lambda own, _: own.found["cpu_seconds"],
+    Column(f"at least, for {STATED} dB", 0): _count(lambda found: found.get("possible", {}).get(STATED)),
+    Column(f"by test views, for {STATED} dB", 0): _count(lambda found: found.get("by_test", {}).get(STATED)),
+    Column(f"share for {STATED} dB", 2): lambda own: own.smallest[STATED]["rows"] / own.found["rows"],
+    Column("knee", 0): _count(lambda found: found["knee"]),
+    Column(f"MB for {STATED} dB", 2, False): lambda own: own.smallest[STATED]["bytes"] / 1e6,
+    Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own: own.smallest[STATED]["frame_ms"],
+    Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own: own.quality_of(own.smallest[STATED]),
+    Column("WS-PSNR of all", 2, True): lambda own: own.quality_of(own.found["steps"][0]),
+    Column("CPU s of the search", 0): lambda own: own.found["cpu_seconds"],
 }
 
 
@@ -162,36 +152,98 @@ def table(run_set: RunSet) -> Table:
     blocks, shown = [], {}
     for title, own in by_conditions(searched(run_set), "resolution", "length").items():
         refuse_mixture(own, run_set.request, title, OF_TIMES)
-        found = by_method(curves(own))
-        first = {one.seed: one for one in next(iter(found.values()))}
-        rows = (Row(of, tuple(_over_seeds(seeds, first, n) for n in COLUMNS.values())) for of, seeds in found.items())
+        rows = (
+            Row(method, tuple(_over_seeds(map(number, seeds)) for number in COLUMNS.values()))
+            for method, seeds in by_method(curves(own)).items()
+        )
         blocks.append(Block(title, tuple(rows)))
         shown[title] = own
     notes = (*footnotes(shown, run_set.request.protocol), *NOTES) if blocks else ()
     return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
 
 
-def _over_seeds(
-    curves: Sequence[Curve], first: Mapping[int, Curve], number: Callable[[Curve, Curve], float | None]
-) -> Cell:
-    """Return the mean over seeds, each beside the first method's curve of its seed, or else its first curve."""
-    values = [number(one, first.get(one.seed, next(iter(first.values())))) for one in curves]
+def _over_seeds(values: Iterable[float | None]) -> Cell:
     return mean_cell([value for value in values if value is not None])
 
 
-def _points(sizes: Sequence[float], qualities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return log2 of the sizes in ascending order, and the qualities."""
-    order = np.argsort(sizes, kind="stable")
-    return np.log2(np.asarray(sizes, dtype=float))[order], np.asarray(qualities, dtype=float)[order]
+def charts(run_set: RunSet) -> list[Chart]:
+    """Return a chart for each scene with a search for the smallest model, and one of test views if there are renders.
+
+    Raises:
+        ReportError: the results of a chart differ in protocol, resolution, length, learning rates, data or machine.
+    """
+    found = []
+    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
+        refuse_mixture(own, run_set.request, title, OF_TIMES)
+        name = file_name(f"smallest_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
+        notes = tuple(footnotes({title: own}, run_set.request.protocol))
+        found.append(_chart(name, title, curves(own), notes))
+        if rendered := [curve for curve in curves(own) if curve.image is not None]:
+            try:
+                found.append(_renders(f"{name}_renders", title, rendered, notes))
+            except OSError as error:
+                run_set.warnings.append(f"a picture is left out: {error}")
+    return found
 
 
-def _mean_difference(ours: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:
-    """Return the mean of ours minus the other over their common range of x (ascending); exact for straight pieces."""
-    low, high = max(ours[0][0], other[0][0]), min(ours[0][-1], other[0][-1])
-    if not low < high:
-        return None
-    inner = [x for curve in (ours, other) for x in curve[0] if low < x < high]
-    at = np.unique([low, *inner, high])
-    from scipy.integrate import trapezoid
+@styled
+def _chart(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) -> Chart:
+    made, axes = figure(len(PANELS), 1, 3.6, 3.4)
+    presets = [curve.preset for curve in found]
+    for panel, (quantity, words, unit) in zip(axes.flat, PANELS, strict=True):
+        sizes = [v * unit for curve in found for v in curve.values(quantity) if math.isfinite(v)]
+        set_axis(panel.xaxis, sizes, spans(sizes, LOG_RATIO))
+        for method, seeds in by_method(found).items():
+            color = color_of(seeds[0].preset, presets)
+            for curve in seeds:
+                _draw(panel, curve, quantity, unit, color, first=curve is seeds[0])
+            panel.plot([], [], color=color, label=method)
+        panel.set_xlabel(words)
+    axes[0, 0].set_ylabel("WS-PSNR of test views, dB ↑")
+    made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    what = (
+        f"{title}\nsmaller models of the same run; ring: smallest for a loss of {LOSSES[0]} dB, square: {LOSSES[1]} dB"
+    )
+    what += "; thin: further seeds" if len(found) > len(by_method(found)) else ""
+    lay_out(made, what)
+    return Chart(name, what, made, notes, _numbers(name, found))
 
-    return float(trapezoid(np.interp(at, *ours) - np.interp(at, *other), at) / (high - low))
+
+@styled
+def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) -> Chart:
+    """Return a test view of each run: ground truth, the whole model, and the smallest models for two losses."""
+    made, axes = figure(4, len(found), 3.6, 2.2)
+    for row, curve in zip(axes, found, strict=True):
+        assert curve.image is not None, "chosen by it"
+        steps = [curve.found["steps"][0], *(curve.smallest[loss] for loss in LOSSES)]
+        words = [curve.title, f"all: {steps[0]['blended']} Gaussians"]
+        words += [f"{loss} dB: {step['blended']}" for loss, step in zip(LOSSES, steps[1:], strict=True)]
+        for panel, part, text in zip(row, split_image(curve.image, 4), words, strict=True):
+            show_image(panel, part, text)
+            panel.set_axis_off()
+    what = f"{title}\na test view: ground truth, whole model, and the smallest that lose {' and '.join(LOSSES)} dB"
+    lay_out(made, what)
+    return Chart(name, what, made, notes)
+
+
+def _draw(panel: Any, curve: Curve, quantity: str, unit: float, color: str, *, first: bool) -> None:
+    """Draw a curve; further seeds of a method are thinner."""
+    xs = [value * unit for value in curve.values(quantity)]
+    there = sorted((x, y) for x, y in zip(xs, curve.quality, strict=True) if math.isfinite(x) and math.isfinite(y))
+    panel.plot(*zip(*there, strict=True), color=color, linewidth=1.2 if first else 0.6)
+    for step, x, y in zip(curve.steps, xs, curve.quality, strict=True):
+        panel.plot([x], [y], MARKERS[0], color=color, markersize=4 if first else 2.5)
+        for loss, around in zip(LOSSES, MARKERS, strict=False):
+            if curve.smallest.get(loss) is step:
+                panel.plot([x], [y], around, markersize=9, fillstyle="none", color=INK, markeredgewidth=1)
+
+
+def _numbers(name: str, found: list[Curve]) -> DataFrame:
+    quantities = ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr", "test_ws_psnr", "lpips")
+    rows = [
+        {"chart": name, "curve": curve.title, "preset": curve.preset, **{q: step[q] for q in quantities}}
+        | {"smallest for": " ".join(loss for loss, at in curve.smallest.items() if at is step)}
+        for curve in found
+        for step in curve.steps
+    ]
+    return DataFrame(rows, dtype=object)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from pandas import DataFrame
 
@@ -60,6 +61,22 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
     else:
         for part in made:
             yield from files(part, svg)
+
+
+def rendered(template: str, **values: Any) -> str:
+    """Return the text of a template in this folder; HTML is escaped, and the filter `md` escapes Markdown."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).resolve().parent),
+        autoescape=select_autoescape(["html.j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["md"] = markdown_text
+    return environment.get_template(template).render(**values)
 
 
 def _short(name: str) -> str:

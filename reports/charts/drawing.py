@@ -1,49 +1,49 @@
-"""The style of charts, one colour per method on white and on black, and the formats PNG and SVG."""
+"""Style, axes and labels of charts, one colour per method, and the formats PNG and SVG."""
 
 from __future__ import annotations
 
 import io
-import re
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from textwrap import wrap
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from pandas import DataFrame
 
 from padgs.reports.methods import method_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
-# Pairs of colours: on white, and on black where readers have a dark screen. The first five are Okabe and Ito's, which
-# colour-blind readers can tell apart. Only PaD-GS and padgs+ are pink.
+# The first five are Okabe and Ito's, which colour-blind readers can tell apart. Only PaD-GS and padgs+ are pink.
 FAMILIES = {
-    "egonerf": ("#e69f00", "#e69f00"),
-    "op43dgs": ("#56b4e9", "#7cc8f2"),
-    "odgs": ("#009e73", "#1fb98c"),
-    "omnigs": ("#d55e00", "#ee7d2b"),
-    "spags": ("#0072b2", "#3f92e0"),
-    "padgs": ("#cc79a7", "#e08fbd"),
-    "padgs_plus": ("#b0005e", "#ff4fa3"),
-    "cubemap_3dgs": ("#333333", "#d5d9e0"),
-    "crops_3dgs": ("#8c6d31", "#c2a05c"),
-    "sc_omnigs": ("#7f7f7f", "#9aa0aa"),
-    "seam360gs": ("#332288", "#9d92ee"),
+    "egonerf": "#e69f00",
+    "op43dgs": "#56b4e9",
+    "odgs": "#009e73",
+    "omnigs": "#d55e00",
+    "spags": "#0072b2",
+    "padgs": "#cc79a7",
+    "padgs_plus": "#b0005e",
+    "cubemap_3dgs": "#333333",
+    "crops_3dgs": "#8c6d31",
+    "sc_omnigs": "#7f7f7f",
+    "seam360gs": "#332288",
 }
-OTHERS = (("#44aa99", "#44aa99"), ("#999933", "#b3b34a"), ("#882255", "#cc6f9c"))
-INK = ("#1d2330", "#e4e8ef")
-SOFT = ("#5b6475", "#a3acbc")
-GRID = ("#e3e6eb", "#333a46")
-PAPER = ("#ffffff", "#171b22")
-COLORS = tuple(light for light, _ in (*FAMILIES.values(), *OTHERS))
+OTHERS = ("#44aa99", "#999933", "#882255")
+INK = "#1d2330"
+SOFT = "#5b6475"
+GRID = "#e3e6eb"
+PAPER = "#ffffff"
+COLORS = (*FAMILIES.values(), *OTHERS)
 ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 DPI = 110
 TITLE_SIZE, SMALL_TITLE_SIZE, NARROW = 10.5, 9.0, 5.0  # points; the small one in figures of up to NARROW inches
 LETTERS = 126  # letters per inch at a font size of one point
-TIP = "tip:"  # prefix of a gid that holds a tooltip
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "font.size": 9,
@@ -51,15 +51,35 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": GRID[0],
+    "grid.color": GRID,
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
     "legend.frameon": False,
-    "figure.facecolor": PAPER[0],
+    "figure.facecolor": PAPER,
     "axes.facecolor": "none",
-    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK[0]),
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
     "text.parse_math": False,  # a $ in a name is a $
 }
+FENCE = 1.5  # interquartile ranges
+PAD = 0.1  # share of the shown range that is free at both ends of an axis
+SINGLE = {False: 1.0, True: 0.5}  # range around a single value: one unit, or half a decade of a logarithmic axis
+GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0, 140.0, 180.0)  # pixels from the mark's edge
+DIRECTIONS = 24
+BESIDE = 7.0  # pixels between a mark and its label; a label further away has a leader line
+CLEARANCE = 1.5  # pixels around a label
+ON_A_MARK = 0.8  # cost of a covered square pixel of a mark, in pixels of distance
+OURS = ("padgs", "padgs_plus")  # methods with bold labels
+FONT_SIZES = {"bold": 9.0, "normal": 8.5, "faint": 7.0}  # points, by weight
+
+
+@dataclass(frozen=True)
+class Label:
+    """The text of a mark at a point in data coordinates, with the radius of the mark in points."""
+
+    text: str
+    at: tuple[float, float]
+    radius: float
+    weight: str  # key of `FONT_SIZES`
 
 
 @dataclass(frozen=True)
@@ -81,19 +101,13 @@ class Chart:
 
     @cached_property
     def svg(self) -> str:
-        """The figure with tooltips, dark on dark screens; equal charts give equal text, others share no id with it."""
+        """The figure with text as text; equal charts give equal files."""
         from matplotlib import rc_context
 
         text = io.StringIO()
         with rc_context({**STYLE, "svg.hashsalt": f"padgs {self.name}"}):
             self.figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-        dark = text.getvalue().replace("</style>", f"\n{dark_rules()}</style>", 1)
-        return re.sub(rf'<g id="{TIP}([^"]*)">', r'<g class="tip"><title>\1</title>', dark)
-
-
-def tip(text: str) -> str:
-    """Return the `gid` of an artist that shows a tooltip in SVG files."""
-    return TIP + text
+        return text.getvalue()
 
 
 def styled(draw: Callable[P, T]) -> Callable[P, T]:
@@ -134,20 +148,113 @@ def show_image(panel: Any, image: Any, title: str) -> None:
 
 
 def color_of(preset: str, presets: Sequence[str]) -> str:
-    """Return the colour of a preset's method on white; methods without one get theirs by their order in `presets`."""
+    """Return the colour of a preset's method; methods without one get theirs by their order in `presets`."""
     if method_of(preset) in FAMILIES:
-        return FAMILIES[method_of(preset)][0]
+        return FAMILIES[method_of(preset)]
     others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in FAMILIES]
-    return OTHERS[others.index(method_of(preset)) % len(OTHERS)][0]
+    return OTHERS[others.index(method_of(preset)) % len(OTHERS)]
 
 
-def dark_rules() -> str:
-    """Return CSS that replaces all colours on dark screens; programs that ignore the rules show white paper."""
-    pairs = dict((*FAMILIES.values(), *OTHERS, INK, SOFT, GRID, PAPER))
-    rules = [
-        f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
-        for light, dark in pairs.items()
-        for what in ("fill", "stroke")
-        if light != dark
-    ]
-    return f"@media (prefers-color-scheme: dark){{{''.join(rules)}}}"
+def window(values: Sequence[float], worse: int) -> tuple[float, float]:
+    """Return the smallest and largest value that is no outlier at the worse end (-1 low, 1 high, 0 neither).
+
+    An outlier lies more than 1.5 interquartile ranges beyond the quartile (Tukey, Exploratory Data Analysis, 1977).
+    At most a quarter of the values are outliers, and the best value never is. Pass logarithms for logarithmic axes.
+
+    >>> window([19.8, 27.4, 27.8, 29.0, 30.0, 31.5], worse=-1), window([20.0, 30.0], worse=-1)
+    ((27.4, 31.5), (20.0, 30.0))
+    """
+    first, third = np.quantile(values, [0.25, 0.75])
+    reach = FENCE * (third - first)
+    low, high = (first - reach if worse < 0 else -math.inf), (third + reach if worse > 0 else math.inf)
+    kept = [value for value in values if low <= value <= high]
+    return min(kept), max(kept)
+
+
+def spans(values: Sequence[float], ratio: float) -> bool:
+    """Return whether all values are positive and the largest is at least `ratio` times the smallest."""
+    return bool(values) and min(values) > 0 and max(values) / min(values) >= ratio
+
+
+def set_axis(axis: Any, values: Sequence[float], logarithmic: bool = False, worse: int = 0) -> tuple[float, float]:
+    """Set limits, scale and ticks of a matplotlib axis for values, all positive if logarithmic; return the limits.
+
+    `worse`: see `window`.
+    """
+    from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullLocator
+
+    scaled = [math.log10(value) if logarithmic else value for value in values or [1.0]]
+    low, high = window(scaled, worse)
+    if high == low:
+        low, high = low - SINGLE[logarithmic] / 2, high + SINGLE[logarithmic] / 2
+    pad = PAD * (high - low)
+    ends = (10 ** (low - pad), 10 ** (high + pad)) if logarithmic else (low - pad, high + pad)
+    panel, name = axis.axes, axis.axis_name
+    getattr(panel, f"set_{name}scale")("log" if logarithmic else "linear")
+    getattr(panel, f"set_{name}lim")(ends)
+    few = logarithmic and ends[1] < 3 * ends[0]
+    axis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0)) if logarithmic and not few else MaxNLocator(6, steps=[1, 2, 5, 10])
+    )
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(EngFormatter(sep="") if ends[1] >= 1e4 else "{x:g}")
+    return ends
+
+
+def write_labels(panel: Any, labels: Sequence[Label], marks: Sequence[tuple[float, float, float]]) -> list[Any]:
+    """Write labels one after the other, each at its cheapest place, and return the texts that found one.
+
+    Positions are fractions of the figure, so its layout must be fixed, and all file formats agree.
+
+    Args:
+        panel: matplotlib axes.
+        labels: the important ones first.
+        marks: x, y (data) and radius (points) of all marks, with and without a label.
+    """
+    figure, points = panel.figure, panel.figure.dpi / 72
+    to_pixels, to_figure = panel.transData.transform, figure.transFigure.inverted().transform
+    discs = np.array([(*to_pixels((x, y)), radius * points) for x, y, radius in marks]).reshape(-1, 3)
+    squares = np.concatenate([discs[:, :2] - discs[:, 2:], discs[:, :2] + discs[:, 2:]], 1)
+    inside = panel.get_window_extent().padded(-CLEARANCE)
+    taken, written = np.zeros((0, 4)), []
+    for label in labels:
+        soft = label.weight == "faint"
+        text = figure.text(0.5, 0.5, label.text, fontsize=FONT_SIZES[label.weight], color=SOFT if soft else INK)
+        text.set(ha="center", va="center", linespacing=1.05, zorder=6, weight="normal" if soft else label.weight)
+        extent, at, radius = text.get_window_extent(), to_pixels(label.at), label.radius * points
+        boxes, costs = _candidates(at, radius, np.array([extent.width, extent.height]))
+        free = (boxes[:, :2] >= inside.min).all(1) & (boxes[:, 2:] <= inside.max).all(1)
+        free &= ~_overlap(boxes, taken).any(1)
+        if not free.any():
+            text.remove()
+            continue
+        boxes, costs = boxes[free], costs[free]
+        box = boxes[np.argmin(costs + ON_A_MARK * _overlap(boxes, squares).sum(1))]
+        taken = np.concatenate([taken, [box + np.array([-1, -1, 1, 1]) * CLEARANCE]])
+        text.set_position(to_figure(box.reshape(2, 2).mean(0)))
+        end = np.clip(at, box[:2], box[2:])
+        if (distance := np.linalg.norm(end - at)) - radius > BESIDE:
+            leader = np.stack([at + (end - at) * radius / distance, end])
+            panel.plot(*panel.transData.inverted().transform(leader).T, color=SOFT, linewidth=0.5, zorder=1.6)
+        written.append(text)
+    return written
+
+
+def weight_of(preset: str, role: str) -> str:
+    """Return the font weight of a preset's label: bold for main presets of ours, faint for variants and releases."""
+    return "faint" if role != "main" else "bold" if method_of(preset) in OURS else "normal"
+
+
+def _candidates(at: NDArray, radius: float, size: NDArray) -> tuple[NDArray, NDArray]:
+    """Return boxes [n, 4] (left, bottom, right, top) around a mark, and costs [n]: best near and to the upper right."""
+    gaps, angles = np.repeat(GAPS, DIRECTIONS), np.tile(np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS), len(GAPS))
+    direction = np.stack([np.cos(angles), np.sin(angles)], 1)
+    # The middle of a box that moves around the disc of the mark without touching it.
+    middles = at + (radius + gaps)[:, None] * direction + size / 2 * np.clip(1.5 * direction, -1, 1)
+    return np.concatenate([middles - size / 2, middles + size / 2], 1), gaps + 2 * (2 - direction.sum(1))
+
+
+def _overlap(boxes: NDArray, others: NDArray) -> NDArray:
+    """Return the areas [n, m] that boxes [n, 4] share with others [m, 4]."""
+    shared = np.minimum(boxes[:, None, 2:], others[:, 2:]) - np.maximum(boxes[:, None, :2], others[:, :2])
+    return np.clip(shared, 0, None).prod(2)

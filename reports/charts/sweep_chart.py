@@ -9,8 +9,7 @@ from typing import Any
 from pandas import DataFrame
 
 from padgs.reports import methods
-from padgs.reports.charts.axis import set_axis, spans
-from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, styled, tip
+from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, set_axis, spans, styled
 from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
 from padgs.reports.frame import by_place, grouped
 from padgs.reports.measures import Measure, costs, metrics, quantity
@@ -172,7 +171,7 @@ def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
         return
     set_axis(panel.xaxis, xs, spans(xs, LOG_RATIO))
     if sweep.key in PAPER_CHOICES:
-        panel.axvline(PAPER_CHOICES[sweep.key], color=SOFT[0], linestyle=":", linewidth=1)
+        panel.axvline(PAPER_CHOICES[sweep.key], color=SOFT, linestyle=":", linewidth=1)
 
 
 def _draw(panel: Any, curve: Curve, index: int, measure: Measure, number: int) -> None:
@@ -181,14 +180,10 @@ def _draw(panel: Any, curve: Curve, index: int, measure: Measure, number: int) -
     there = [(x, c) for x, c in cells if c.value is not None]
     xs, values, stds = [x for x, _ in there], [c.value for _, c in there], [c.std or 0.0 for _, c in there]
     connected = "-" if all(isinstance(x, (int, float)) for x in xs) else ""
-    panel.errorbar(xs, values, yerr=stds, color=color, linestyle=connected, linewidth=1.2, capsize=2.5)
-    for x, c in there:
-        gid = tip(f"{curve.title}\n{x}: {c.text(measure.column)}")
-        panel.plot([x], [c.value], marker, color=color, markersize=5, gid=gid)
-    panel.plot([], [], marker, color=color, linestyle=connected or "none", label=curve.title)
+    panel.errorbar(xs, values, yerr=stds, color=color, linestyle="none", linewidth=1.2, capsize=2.5)
+    panel.plot(xs, values, marker, color=color, markersize=5, linestyle=connected or "none", label=curve.title)
     for x, c in cells:
         if c.status:  # at the bottom edge, on any scale
             bottom, status = panel.get_xaxis_transform(), c.status.upper()
-            gid = tip(f"{curve.title}\n{x}: {status}")
-            panel.plot([x], [0.03], "x", color=color, transform=bottom, clip_on=False, gid=gid)
+            panel.plot([x], [0.03], "x", color=color, transform=bottom, clip_on=False)
             panel.annotate(status, (x, 0.05), xycoords=bottom, fontsize=6, color=color, ha="center")

@@ -12,9 +12,21 @@ from typing import Any
 import numpy as np
 
 from padgs.reports import methods
-from padgs.reports.charts.axis import set_axis
-from padgs.reports.charts.drawing import ALPHA, INK, PAPER, SOFT, Chart, color_of, figure, lay_out, styled, tip
-from padgs.reports.charts.labels import Label, weight_of, write_labels
+from padgs.reports.charts.drawing import (
+    ALPHA,
+    INK,
+    PAPER,
+    SOFT,
+    Chart,
+    Label,
+    color_of,
+    figure,
+    lay_out,
+    set_axis,
+    styled,
+    weight_of,
+    write_labels,
+)
 from padgs.reports.charts.trade_off import Point, TradeOff, equal_times, pareto, trade_offs
 from padgs.reports.measures import COSTS
 from padgs.reports.selection import RunSet, Setting, settings
@@ -119,11 +131,10 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     named = _named(trade_off, curves, low, high)
     for setting, seconds, psnr in curves:
         title, preset, role = setting.title, setting.preset, trade_off.role(setting.preset)
-        color = color_of(preset, presets) if preset in named else SOFT[0]
+        color = color_of(preset, presets) if preset in named else SOFT
         look = {"color": color, "alpha": ALPHA[role]} | LOOKS[role]
         panel.plot(seconds, psnr, **look)
-        gid = tip(f"{title}\n{psnr[-1]:.2f} dB after {seconds[-1]:.0f} s")
-        panel.plot(seconds[-1], psnr[-1], **look, marker="o", markersize=2 * END_RADIUS, gid=gid)
+        panel.plot(seconds[-1], psnr[-1], **look, marker="o", markersize=2 * END_RADIUS)
         if named.get(preset) == title:
             text = methods.short(title, preset)
             labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
@@ -208,15 +219,14 @@ def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, scale: float, 
         x_std = [[min(x_std or 0.0, 0.9 * mark.x)], [x_std or 0.0]]  # a logarithmic axis has no zero
         look = {"color": color, "linewidth": 0.8, "alpha": 0.6 * ALPHA[mark.role], "zorder": 2}
         panel.errorbar(mark.x, mark.y, yerr=y_std, xerr=x_std, linestyle="none", **look)
-    words = [f"{name}: {brief(cell.value, 4)}" for name, cell in numbers.items() if cell.value is not None]
     look = {"alpha": ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
     if mark.role == "release":
         look |= {"facecolors": "none", "edgecolors": color, "linewidths": 1.0}
     else:
         ours = weight_of(mark.point.preset, mark.role) == "bold"
-        edge = {"edgecolors": INK[0], "linewidths": 1.2} if ours else {"edgecolors": PAPER[0], "linewidths": 0.5}
+        edge = {"edgecolors": INK, "linewidths": 1.2} if ours else {"edgecolors": PAPER, "linewidths": 0.5}
         look |= {"facecolors": color, "marker": "o" if mark.gaussians else "D", **edge}
-    panel.scatter(mark.x, mark.y, s=_area(mark, scale), gid=tip("\n".join([mark.point.title, *words])), **look)
+    panel.scatter(mark.x, mark.y, s=_area(mark, scale), **look)
 
 
 def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
@@ -225,7 +235,7 @@ def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
     corners += [(max(panel.get_xlim()[1], corners[-1][0]), corners[-1][1])] if corners else []
     steps = [*corners[:1], *(at for (_, y), (x, top) in pairwise(corners) for at in ((x, y), (x, top)))]
     if steps:
-        panel.plot(*zip(*steps, strict=True), color=SOFT[0], linewidth=0.9, zorder=1.5)
+        panel.plot(*zip(*steps, strict=True), color=SOFT, linewidth=0.9, zorder=1.5)
 
 
 def _label(panel: Any, marks: Sequence[Mark], scale: float) -> list[Any]:
@@ -238,13 +248,13 @@ def _label(panel: Any, marks: Sequence[Mark], scale: float) -> list[Any]:
     return write_labels(panel, labels, [(mark.x, mark.y, radius) for mark, radius in inside])
 
 
-def brief(value: float, digits: int = 3) -> str:
-    """Return a number with so many digits, or all digits before the point.
+def brief(value: float) -> str:
+    """Return a number with three digits, or all digits before the point.
 
     >>> brief(24.8512), brief(123456.0)
     ('24.9', '123,456')
     """
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.{digits}g}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _handles(marks: Sequence[Mark], scale: float) -> list[Any]:
@@ -253,7 +263,7 @@ def _handles(marks: Sequence[Mark], scale: float) -> list[Any]:
     from matplotlib.ticker import EngFormatter
 
     def dot(size: float, label: str, **look: Any) -> Line2D:
-        look = {"marker": "o", "color": SOFT[0], "markeredgewidth": 0} | look
+        look = {"marker": "o", "color": SOFT, "markeredgewidth": 0} | look
         return Line2D([], [], linestyle="none", markersize=math.sqrt(size), label=label, **look)
 
     counts = [mark.gaussians for mark in marks if mark.gaussians]
@@ -266,7 +276,7 @@ def _handles(marks: Sequence[Mark], scale: float) -> list[Any]:
         handles.append(dot(90.0, "variant of a method", alpha=ALPHA["variant"]))
     if any(mark.role == "release" for mark in marks):
         handles.append(dot(FIXED, "program as released", markerfacecolor="none", markeredgewidth=1.0))
-    return [*handles, Line2D([], [], color=SOFT[0], linewidth=0.9, label="Pareto front")]
+    return [*handles, Line2D([], [], color=SOFT, linewidth=0.9, label="Pareto front")]
 
 
 def _conditions(trade_off: TradeOff) -> str:

@@ -1,23 +1,7 @@
 "use strict";
-// Sorting, tooltips, and the choice of test views; the libraries above do the rest.
+// Sorting, and the choice of test views; the libraries above do the rest.
 
 for (const table of document.querySelectorAll("table.sortable")) new Tablesort(table);
-
-// Titles of SVG elements appear late and cannot be styled: show them at once, beside the pointer.
-const tip = document.getElementById("tip");
-for (const mark of document.querySelectorAll(".tip")) {
-  const title = mark.querySelector("title");
-  mark.dataset.tip = title.textContent;
-  title.remove();
-  mark.addEventListener("pointerenter", () => { tip.textContent = mark.dataset.tip; tip.hidden = false; });
-  mark.addEventListener("pointerleave", () => { tip.hidden = true; });
-}
-document.addEventListener("pointermove", (event) => {
-  if (tip.hidden) return;
-  const left = Math.min(event.clientX + 14, innerWidth - tip.offsetWidth - 8);
-  tip.style.left = `${left}px`;
-  tip.style.top = `${Math.min(event.clientY + 14, innerHeight - tip.offsetHeight - 8)}px`;
-});
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const urls = [];

@@ -22,13 +22,12 @@ from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
 from padgs.reports.selection import RunSet, Setting, settings
 from padgs.reports.store import render_names, split_image
-from padgs.reports.table import Block, Cell, ReportError, Row, Table
-from padgs.reports.writers import rows_of
+from padgs.reports.table import Block, Cell, Column, ReportError, Table
+from padgs.reports.writers import rendered, rows_of
 
 HERE = Path(__file__).resolve().parent
 SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-comparison-slider.js")
 STYLES = ("pannellum.css", "img-comparison-slider.css")
-LOWEST = "-1e99"  # sort key of a cell without a number
 IMAGE_WIDTH = 1024  # maximum pixels of an embedded panorama
 JPEG_QUALITY = 80
 MAX_VIEWS = 3  # per scene
@@ -55,11 +54,6 @@ class Album:
 
 def html(run_set: RunSet) -> str:
     """Return the page with all other reports; a refused report is named at the top."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
     made: dict[str, list[Any]] = {}
     refused: list[str] = []
     for name in REPORTS:
@@ -71,10 +65,13 @@ def html(run_set: RunSet) -> str:
         made[name] = report if isinstance(report, list) else [report]
     tables = [part for parts in made.values() for part in parts if isinstance(part, Table)]
     views = album(run_set)
-    return environment.get_template("page.html.j2").render(
+    return rendered(
+        "page/page.html.j2",
         facts=_facts(run_set.runs),
         problems=[*run_set.left_out, *refused, *run_set.warnings],
-        tables=[_table(shown) for table in tables if (shown := _measured(table)).blocks],
+        tables=[shown for table in tables if (shown := _measured(table)).blocks],
+        rows_of=rows_of,
+        spans=_spans,
         maps=_charts(made["stability"]),
         charts=_charts([*made["chart"], *made["smallest_chart"]]),
         sweeps=_charts(made["sweep"]),
@@ -161,33 +158,15 @@ def _measured(table: Table) -> Table:
     return replace(table, blocks=tuple(filter(has_ours, table.blocks)))
 
 
-def _table(table: Table) -> dict[str, Any]:
-    blocks = [_block(table.single(block, drop_empty=True)) for block in table.blocks]
-    named = {"name": table.name, "title": table.title, "corner": table.corner}
-    return {**named, "blocks": blocks, "notes": table.notes}
-
-
-def _block(table: Table) -> dict[str, Any]:
-    (block,) = table.blocks
-    groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, lambda column: column.group)]
-    return {
-        "title": block.title,
-        "groups": groups if any(size > 1 for _, size in groups) else [],
-        "headings": [column.heading for column in table.columns],
-        "rows": [_row(row, *shown) for row, shown in zip(block.rows, rows_of(table), strict=True)],
-    }
-
-
-def _row(row: Row, title: str, cells: Sequence[tuple[str, str | None]]) -> dict[str, Any]:
-    keys = (LOWEST if cell.value is None else f"{cell.value:.9f}" for cell in row.cells)
-    shown = [{"text": text, "sort": key, "style": rank or ""} for key, (text, rank) in zip(keys, cells, strict=True)]
-    return {"title": title, "cells": shown}
+def _spans(columns: Sequence[Column]) -> list[tuple[str, int]]:
+    """Return heading and width of groups of columns; none if no group has several."""
+    groups = [(group, len(list(own))) for group, own in groupby(columns, lambda column: column.group)]
+    return groups if any(size > 1 for _, size in groups) else []
 
 
 def _charts(parts: Sequence[Any]) -> list[dict[str, Any]]:
     charts = [part for part in parts if isinstance(part, Chart)]
-    # The lines before <svg are for a file.
-    return [{"title": one.title, "svg": one.svg[one.svg.index("<svg") :], "notes": one.notes} for one in charts]
+    return [{"title": one.title, "png": base64.b64encode(one.png).decode(), "notes": one.notes} for one in charts]
 
 
 def _vendored(name: str) -> str:

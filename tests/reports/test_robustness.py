@@ -4,15 +4,11 @@ import pytest
 from support.made_up import failed, of_experiment, run_set
 
 from padgs.data.perturb import CONDITIONS
-from padgs.reports.charts.robustness_chart import STATUS_LETTERS
-from padgs.reports.frame import frame
 from padgs.reports.page import page
-from padgs.reports.robustness import LIMITS, LIMITS_ARE_FOR, limits, stability, stressed_methods
-from padgs.reports.selection import RunSet
-from padgs.reports.store import Run
+from padgs.reports.robustness import LIMITS, LIMITS_ARE_FOR, STATUS_LETTERS, limits, stability, stressed_methods
 from padgs.reports.table import ReportError
 from padgs.reports.writers import latex, markdown
-from padgs.results import STATUSES, Scores, picture_name
+from padgs.results import STATUSES, Scores
 
 RULES = {"name": "stability", "lpips": "none", "lpips_inputs": "11", "bottom_crop": 0.0}
 WIDTH, HEIGHT = map(int, LIMITS_ARE_FOR[0].split("x"))
@@ -94,12 +90,12 @@ def test_the_pole_gap_is_shown_with_that_of_the_scene(oracle, row):
 
 def test_an_incomplete_method_has_no_score_and_stands_last():
     for incomplete in (runs(), [*runs(), MISSING[0]]):
-        table, _, chart = stability(run_set(incomplete))
+        table, _ = stability(run_set(incomplete))
         assert [column.title for column in table.columns] == [OMNIGS, "PaD-GS"]
         scores = cells(table, "synthetic-room")
         for row in ("stability score", "worst quartile", "failure rate"):
             assert scores[row]["PaD-GS"] == "–" != scores[row][OMNIGS]
-        assert scores["unstressed: WS-PSNR, dB"]["PaD-GS"] == "32.00" and "score –, worst quartile –" in chart.svg
+        assert scores["unstressed: WS-PSNR, dB"]["PaD-GS"] == "32.00"
 
 
 def test_some_conditions_are_shown_but_not_scored():
@@ -146,14 +142,11 @@ def test_files_and_page():
         run("spags", 0.0, "pose_noise", 2, status="diverged"),
         run("spags", 20.0, "seam", 2),
     ]
-    table, heat_map, scatter = stability(run_set([*runs(), *complete]))
+    table, heat_map = stability(run_set([*runs(), *complete]))
     assert heat_map.name == "stability-synthetic-room-256x128"
-    assert "pose_noise 2: keeps 0.40; WS-PSNR 16.00 dB, 22.00 without" in heat_map.svg and ">V<" in heat_map.svg
+    assert ">.40<" in heat_map.svg and ">V<" in heat_map.svg and ">.52<" not in heat_map.svg, "level 2"
     assert "V diverged" in heat_map.svg and "exploded" not in heat_map.svg and heat_map.png.startswith(b"\x89PNG")
-    assert heat_map.numbers is not None and [*heat_map.numbers["preset"].unique()] == ["omnigs", "spags"]
-    assert {*heat_map.numbers["level"]} == {2} and "left out: PaD-GS." in heat_map.notes[-1]
-    assert scatter.numbers is not None and scatter.name == "robustness-synthetic-room-256x128"
-    assert dict(scatter.numbers.set_index("preset")["score"])["omnigs"] == pytest.approx(0.575)
+    assert "left out: PaD-GS." in heat_map.notes[-1]
     assert "| 0.00 \\[DIVERGED\\] |" in markdown(table) and "DIVERGED" in latex(table)
     html = page.html(run_set(runs()))
     assert 'id="stability"' in html and 'id="heat_maps"' in html
@@ -165,18 +158,6 @@ def test_the_name_of_a_condition_is_text_and_not_markup():
     assert "<b-x>" not in markdown(table) and all("<b-x>" not in chart.svg for chart in charts)
     html = page.html(run_set(made))
     assert "<b-x>" not in html and "&lt;b-x&gt; 1" in html
-
-
-def test_a_cell_opens_its_worst_view(tmp_path):
-    made = run("omnigs", 16.0, "pose_noise", 2)
-    views = {name: {**made.scores["stability"].metrics, "ws_psnr": value} for name, value in (("a", 17.0), ("b", 15.0))}
-    made = replace(made, scores={"stability": replace(made.scores["stability"], views=views)})
-    for name in views:
-        (tmp_path / picture_name(name)).touch()
-    _, chart, _ = stability(RunSet(frame([Run(run("omnigs", 22.0)), Run(made, renders=tmp_path)])))
-    assert (tmp_path / picture_name("b")).resolve().as_uri() in chart.svg
-    assert (tmp_path / picture_name("a")).resolve().as_uri() not in chart.svg
-    assert "opens its worst view" in chart.notes[1] and "file:" not in stability(run_set(runs()))[1].svg
 
 
 def test_losses_stand_beside_their_limits():

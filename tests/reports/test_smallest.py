@@ -6,8 +6,7 @@ import pytest
 from PIL import Image
 from support.made_up import run_set, small
 
-from padgs.reports.charts.smallest_chart import charts
-from padgs.reports.smallest import curves, gain, ratio, searched, table
+from padgs.reports.smallest import charts, table
 from padgs.reports.table import ReportError
 from padgs.reports.writers import markdown
 
@@ -89,25 +88,11 @@ def test_a_share_has_no_better_end_and_times_of_two_machines_are_not_compared():
             build(elsewhere)
 
 
-def test_curves_are_compared_where_both_are():
-    ours, other = curves(searched(run_set(runs())))
-    assert gain(ours, other) == pytest.approx(1.0) and gain(ours, ours) == 0
-    assert ratio(ours, ours) == 1 and ratio(ours, other) is None, "they share no quality"
-    halved = [small(30.0, method="odgs", smallest=found(30.0)), small(30.0, method="omnigs", smallest=found(30.0))]
-    for step in halved[0].smallest["steps"]:
-        step["blended"] //= 2
-    first, second = curves(searched(run_set(halved)))
-    assert {first.preset: ratio(first, second), second.preset: ratio(second, first)} == pytest.approx(
-        {"odgs": 0.5, "omnigs": 2.0}
-    )
-
-
 def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     (chart,) = charts(run_set(runs()))
     assert chart.name == "smallest_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
     assert list(chart.numbers["smallest for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
-    assert "4000 Gaussians" in chart.svg and "lost 0.65 dB" in chart.svg
 
 
 def test_charts_of_scenes_of_two_data_sets_have_names_of_their_own():

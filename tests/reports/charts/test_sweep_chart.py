@@ -74,11 +74,10 @@ def test_protocols_are_not_mixed_along_a_curve_nor_data_in_a_point():
         sweeps(run_set([first, replace(first, fingerprint="other", run="other"), *others]))
 
 
-def test_a_chart_has_readable_text_and_tooltips_with_numbers():
+def test_a_chart_has_readable_text():
     (made,) = charts(run_set(swept("tau"), protocol="sphere"))
     assert made.name == "sweep_tau_cpu" and made.png.startswith(b"\x89PNG")
     assert ">method.tau<" in made.svg and "WS-PSNR" in made.svg
-    assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in made.svg
 
 
 def test_a_metric_without_values_has_no_panel():
