@@ -181,22 +181,15 @@ class _Job:
                 use = np.ones((image.height, image.width), bool) if mask is None else mask().numpy() >= 0.5
                 Image.fromarray(use * np.uint8(255)).save(masks / f"{short}.png", compress_level=1)
         if self.options.accurate:
-            self._render_views()
-
-    def _render_views(self) -> None:
-        sizes = {(image.width, image.height) for image in self.source.images.values()}
-        if len(sizes) > 1:
-            raise DataError(
-                f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sorted(sizes))}); --accurate "
-                "needs one: resize them, or omit it"
-            )
-        rig.render_views(
-            self.paths,
-            {short: self.work / "masks" / f"{short}.png" for short in self.files} if self.source.masks else {},
-            self.work / "views",
-            self.work / "view_masks",
-            partial(self.progress, "views"),
-        )
+            sizes = sorted({(image.width, image.height) for image in self.source.images.values()})
+            if len(sizes) > 1:
+                raise DataError(
+                    f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sizes)}); --accurate "
+                    "needs one: resize them, or omit it"
+                )
+            mask_files = {short: masks / f"{short}.png" for short in self.files} if self.source.masks else {}
+            folders = self.work / "views", self.work / "view_masks"
+            rig.render_views(self.paths, mask_files, *folders, partial(self.progress, "views"))
 
     def _extract_features(self) -> None:
         masks = self.work / ("view_masks" if self.options.accurate else "masks")
@@ -215,8 +208,7 @@ class _Job:
                 for view in range(self.views)
             ]
         by_size: dict[tuple[int, int], list[str]] = {}
-        for short, name in self.files.items():
-            image = self.source.images[name]
+        for short, image in zip(self.files, self.source.images.values(), strict=True):
             by_size.setdefault((image.width, image.height), []).append(short)
         return [sfm.Group(tuple(names), *size) for size, names in by_size.items()]
 
@@ -238,7 +230,8 @@ class _Job:
 
     def _write(self) -> Prepared:
         self.progress("result", 0, 1)
-        model, others = self._largest_part()
+        parts = map(colmap.pycolmap_module().Reconstruction, sorted((self.work / "parts").iterdir()))
+        model, *others = sorted(parts, key=lambda part: -part.num_reg_frames())
         sfm.refine(model, self.threads)
         frames, cloud, tracks = self._panoramas(model)
         notes = list(self.source.notes)
@@ -252,15 +245,18 @@ class _Job:
                 f"{len(unregistered)} of {len(self.files)} panoramas have no pose: {listed(unregistered)}; {_REMEDIES}"
             )
         if others:
-            notes.append(
-                f"{len(others)} smaller part(s) of {listed(others)} panoramas are not connected to the largest"
-            )
+            sizes = listed(part.num_reg_frames() for part in others)
+            notes.append(f"{len(others)} smaller part(s) of {sizes} panoramas are not connected to the largest")
         seconds = self.folder.seconds
         result = Prepared(
             self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), seconds, tuple(notes)
         )
         partial_folder = self.folder.empty("out")
-        self._copy_images(frames, partial_folder)
+        for frame in frames:
+            target = partial_folder / "images" / frame.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(frame.image, target)
+        write_masks({view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}, partial_folder)
         write_colmap(Content(frames, cloud, tracks, {}), partial_folder)
         result.write(partial_folder, self.options, self.input)
         if self.destination.exists():
@@ -269,13 +265,6 @@ class _Job:
         shutil.rmtree(self.work, ignore_errors=True)
         self.progress("result", 1, 1)
         return result
-
-    def _largest_part(self) -> tuple[Any, list[int]]:
-        """Return the part with most panoramas, and the sizes of the others."""
-        pycolmap = colmap.pycolmap_module()
-        parts = [pycolmap.Reconstruction(str(path)) for path in sorted((self.work / "parts").iterdir())]
-        parts.sort(key=lambda part: -part.num_reg_frames())
-        return parts[0], [part.num_reg_frames() for part in parts[1:]]
 
     def _panoramas(self, model: Any) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
         """Return frames with their original names, points and observations."""
@@ -289,13 +278,6 @@ class _Job:
             frames, cloud, tracks = capture.frames, capture.cloud, capture.tracks()
         named = (replace(frame, name=self.files[frame.name], image=self.paths[frame.name]) for frame in frames)
         return tuple(named), cloud, tracks
-
-    def _copy_images(self, frames: tuple[Frame, ...], folder: Path) -> None:
-        for frame in frames:
-            target = folder / "images" / frame.name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(frame.image, target)
-        write_masks({view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}, folder)
 
     def _progress(self, step: str, done: int, total: int) -> None:
         """Report a batch, and stop before the next one if the disk is full."""

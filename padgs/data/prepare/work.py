@@ -13,9 +13,8 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from padgs.data.assemble import PREPARED
 from padgs.data.capture import DataError
@@ -112,12 +111,10 @@ def find_result(source: Path, destination: Path, options: PrepareOptions) -> Pre
         record = json.loads((destination / PREPARED).read_text(encoding="utf-8"))
         if record["input"] != digest_of(fingerprint(source, options), options):
             return None
-        known: dict[str, Any] = {field.name: record[field.name] for field in fields(Prepared) if field.name != "folder"}
+        lists = {name: tuple(record[name]) for name in ("registered", "unregistered", "notes")}
+        return Prepared(destination, points=record["points"], observations=record["observations"], **lists)
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    lists = {name: tuple(known[name]) for name in ("registered", "unregistered", "notes")}
-    known |= {**lists, "seconds": {}}
-    return Prepared(destination, **known)
 
 
 def fingerprint(source: Path, options: PrepareOptions) -> str:

@@ -61,6 +61,7 @@ def draw(
         mean = color.reshape(3, len(rows), len(columns), samples).mean(-1)
         image[np.ix_(rows, columns)] = np.clip(mean * 255 + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
+    _ = world.light_maps  # baked once, before the threads
     with ThreadPoolExecutor(workers()) as pool:  # numpy releases the interpreter lock
         list(pool.map(fill, blocks))
     return image

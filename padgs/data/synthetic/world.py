@@ -8,7 +8,7 @@ floor. Mirror-like materials show one reflection.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -153,13 +153,12 @@ class World:
     shapes: tuple[Shape, ...]
     light: Light
     sky: Callable[[Array], Array] | None = None  # directions [3, n] -> colours [3, n]
-    light_maps: dict[tuple[int, int], LightMap] = field(default_factory=dict, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        for index, shape in enumerate(self.shapes):
-            if isinstance(shape, Flat):
-                for face in range(shape.faces):
-                    self.light_maps[index, face] = bake(self, shape, face)
+    @cached_property
+    def light_maps(self) -> dict[tuple[int, int], LightMap]:
+        """Light maps by shape and face; baked when colours are first needed."""
+        flat = [(index, shape) for index, shape in enumerate(self.shapes) if isinstance(shape, Flat)]
+        return {(index, face): bake(self, shape, face) for index, shape in flat for face in range(shape.faces)}
 
     def nearest(self, origin: Array, direction: Array, candidates: Sequence[int] | None = None) -> tuple[Array, Array]:
         """Return distance [n] (inf if nothing is hit) and object id [n] (then SKY) of the first hit.

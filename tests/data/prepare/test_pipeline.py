@@ -75,7 +75,7 @@ def test_exact_poses_are_found(scene, prepared):
 
 
 def test_the_result_is_level_complete_and_ready(prepared):
-    result, out, _ = prepared
+    result, out, calls = prepared
     assert sorted(path.name for path in out.iterdir()) == ["images", "prepare.json", "sparse"]
     assert sorted(path.name for path in out.parent.iterdir()) == ["done"]  # no working folder left
     poses = torch.stack([frame.cam_from_world for frame in padgs.data.read(out).frames])
@@ -84,10 +84,6 @@ def test_the_result_is_level_complete_and_ready(prepared):
     stated = json.loads((out / "prepare.json").read_text(encoding="utf-8"))
     assert stated["points"] == result.points > 300
     assert check(out).problems == []
-
-
-def test_progress_counts_up_to_all(prepared):
-    _, _, calls = prepared
     last = {step: (done, total) for step, done, total in calls}
     pairs = VIEWS * (VIEWS - 1) // 2
     assert last == {"features": (VIEWS,) * 2, "matches": (pairs,) * 2, "poses": (VIEWS,) * 2, "result": (1, 1)}
@@ -158,35 +154,29 @@ def test_masked_pixels_have_no_features_and_the_mask_is_copied(scene, tmp_path, 
         prepare(video, tmp_path / "out", options)
 
 
-def test_unrelated_images_are_reported(scene, tmp_path):
-    source = tmp_path / "in"
-    source.mkdir()
-    for index in range(3):
-        shutil.copy(scene[1] / f"pano 00{index}.png", source)
-    noise = np.random.default_rng(0).integers(0, 256, (256, 512, 3), np.uint8)
-    Image.fromarray(noise).save(source / "other.png")
-    result = prepare(source, tmp_path / "out", PrepareOptions(threads=2))
-    assert result.unregistered == ("other.png",)
-    assert any("1 of 4 panoramas have no pose: other.png" in note for note in result.notes)
-    assert not (tmp_path / "out" / "images" / "other.png").exists()
-
-
 def noise(folder, count=2):
     """Write panoramas of noise to a folder."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     for index in range(count):
         pixels = np.random.default_rng(index).integers(0, 256, (64, 128, 3), np.uint8)
         Image.fromarray(pixels).save(folder / f"{index}.png")
     return folder
 
 
-def test_unrelated_images_alone_are_refused(tmp_path, monkeypatch):
-    calls = []
-    monkeypatch.setattr(pipeline, "threads_for", lambda *size: calls.append(size) or 1)
-    with pytest.raises(DataError, match="no relative pose was found for any two of the 2 panoramas"):
-        prepare(noise(tmp_path / "in"), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    assert calls == [(128, 64)]
+def test_unrelated_images_are_reported_and_refused_if_there_are_no_others(scene, tmp_path, monkeypatch):
+    source, calls = noise(tmp_path / "in"), []
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "threads_for", lambda *size: calls.append(size) or 1)
+        with pytest.raises(DataError, match="no relative pose was found for any two of the 2 panoramas"):
+            prepare(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists() and calls == [(128, 64)]
+    (source / "0.png").unlink()
+    for index in range(3):
+        shutil.copy(scene[1] / f"pano 00{index}.png", source)
+    result = prepare(source, tmp_path / "out", PrepareOptions(threads=2))
+    assert result.unregistered == ("1.png",)
+    assert any("1 of 4 panoramas have no pose: 1.png" in note for note in result.notes)
+    assert not (tmp_path / "out" / "images" / "1.png").exists()
 
 
 def test_a_result_inside_its_source_is_not_read_as_input(scene, tmp_path):
@@ -258,14 +248,14 @@ def test_bad_input_is_refused(scene, tmp_path):
         PrepareOptions(per_second=0.0)
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").touch()
-    with pytest.raises(DataError, match="nothing is overwritten"):
-        prepare(scene[1], tmp_path / "there")
-    with pytest.raises(DataError, match="is not a folder"):
-        prepare(tmp_path / "absent", tmp_path / "out")
-    with pytest.raises(DataError, match="cannot be read"):
-        prepare(tmp_path / "absent.mp4", tmp_path / "out")
-    with pytest.raises(DataError, match="images would be read as the images or masks of"):
-        prepare(scene[1], scene[1] / "images")
+    for source, destination, message in (
+        (scene[1], tmp_path / "there", "nothing is overwritten"),
+        (tmp_path / "absent", tmp_path / "out", "is not a folder"),
+        (tmp_path / "absent.mp4", tmp_path / "out", "cannot be read"),
+        (scene[1], scene[1] / "images", "images would be read as the images or masks of"),
+    ):
+        with pytest.raises(DataError, match=message):
+            prepare(source, destination)
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 

@@ -9,9 +9,8 @@ from padgs.data.prepare import rig
 from padgs.geometry.panorama import direction, project, rays, sample
 
 
-def test_rig_views_are_rotations():
+def test_rig_views_are_rotations_and_every_direction_belongs_to_one():
     rotations = rig.cam_from_pano()
-    assert rotations.shape == (12, 3, 3)
     torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(12, 3, 3))
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(12, dtype=torch.float64))
     # The first view of the upper row looks ahead and 35 degrees up (-y); its right is the panorama's right.
@@ -19,22 +18,16 @@ def test_rig_views_are_rotations():
     torch.testing.assert_close(rotations[0] @ ahead_up, torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(rotations[0, 0], torch.tensor([1.0, 0.0, 0.0]).double())
     assert (rotations[:, 1, 1] > 0).all()  # no view hangs upside down
-
-
-def test_every_direction_belongs_to_one_view():
     every = rays(256, 128, dtype=torch.float64)
     owners = torch.stack([rig.owned(index, every) for index in range(12)])
     assert (owners.sum(0) == 1).all()
-    rotations = rig.cam_from_pano()
-    seen = torch.zeros(128, 256, dtype=torch.bool)
-    for index in range(12):
-        x, y, z = (every @ rotations[index].mT).unbind(-1)
-        seen |= owners[index] & (z > 0) & (x.abs() <= z) & (y.abs() <= z)
+    x, y, z = (every @ rotations[:, None].mT).unbind(-1)
+    seen = (owners & (z > 0) & (x.abs() <= z) & (y.abs() <= z)).any(0)
     latitude = (torch.arange(128) + 0.5) / 128 * 180 - 90
     assert seen[latitude.abs() < 70].all()
 
 
-def test_rig_views_resample_the_panorama():
+def test_rig_views_resample_the_panorama_at_the_resolution_of_its_horizon():
     """Compare with a smooth function of the direction, seam and poles included."""
 
     def color(directions):
@@ -46,9 +39,6 @@ def test_rig_views_resample_the_panorama():
         pano_rays = rig.view_lens(512).rays(dtype=torch.float64) @ rotation
         difference = (sample(image, pano_rays).round().int() - color(pano_rays).int()).abs()
         assert difference.max() <= 2
-
-
-def test_views_keep_the_resolution_of_the_horizon():
     lens = rig.view_lens(2048)
     assert lens.width == lens.height == 652
     center = lens.rays(dtype=torch.float64)[326, 325:327]
@@ -62,16 +52,10 @@ def test_files_and_masks_of_views(tmp_path):
     mask[:16] = 0  # only what is below the horizon
     Image.fromarray(image).save(tmp_path / "a.png")
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    calls = []
-    rig.render_views(
-        {"a.png": tmp_path / "a.png"},
-        {"a.png": tmp_path / "mask.png"},
-        tmp_path / "views",
-        tmp_path / "masks",
-        lambda *step: calls.append(step),
-    )
+    calls, used = [], {}
+    paths = {"a.png": tmp_path / "a.png"}, {"a.png": tmp_path / "mask.png"}, tmp_path / "views", tmp_path / "masks"
+    rig.render_views(*paths, lambda *step: calls.append(step))
     assert calls == [(1, 1)]
-    used = {}
     for index in range(12):
         name = rig.view_name(index, "a.png")
         assert rig.split_name(name) == (index, "a.png")

@@ -1,5 +1,7 @@
-"""Pairs to match, and level worlds."""
+"""Pairs to match, level worlds, and resources of the machine."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -7,19 +9,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from padgs.data.capture import Cloud, Frame
+from padgs.data.prepare import work
 from padgs.data.prepare.pipeline import level_world
 from padgs.data.prepare.sfm import EXHAUSTIVE_UP_TO, image_pairs
 
 NAMES = [f"{index:04d}" for index in range(500)]
 
 
-def test_few_images_are_paired_exhaustively():
+def test_few_images_are_paired_exhaustively_and_many_sequentially_with_loop_closure():
     pairs = image_pairs(NAMES[:EXHAUSTIVE_UP_TO])
     assert len(pairs) == len(set(pairs)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) // 2
     assert image_pairs(NAMES[:200], "exhaustive")[-1] == ("0198", "0199")
-
-
-def test_many_images_are_paired_sequentially_with_loop_closure():
     pairs = set(image_pairs(NAMES))
     assert len(pairs) < 20 * len(NAMES)
     assert all(a < b for a, b in pairs)
@@ -27,9 +27,6 @@ def test_many_images_are_paired_sequentially_with_loop_closure():
         assert ("0100", f"{100 + step:04d}") in pairs
     assert ("0100", "0111") not in pairs
     assert ("0000", "0499") in pairs  # a path that comes back to its start
-
-
-def test_order_of_names_does_not_matter():
     assert image_pairs(NAMES[::-1]) == image_pairs(NAMES)
 
 
@@ -49,3 +46,39 @@ def test_worlds_are_levelled_by_the_smallest_rotation():
         torch.testing.assert_close(-frame.cam_from_world[1, :3], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
         assert (rotation.trace().item() - 1) / 2 == pytest.approx(vector[2], abs=1e-9)  # cosine of its angle
+
+
+def test_threads_are_limited_by_free_memory(monkeypatch):
+    assert work.free_memory() > 50_000_000
+    monkeypatch.setattr(os, "cpu_count", lambda: 12)
+    free = {"bytes": 2_000_000_000}
+    monkeypatch.setattr(work, "free_memory", lambda: free["bytes"])
+    assert work.threads_for(2048, 1024) == work.threads_for(512, 256) == 3
+    assert work.threads_for(4096, 2048) == work.threads_for(8192, 4096) == 1
+    for free["bytes"] in (None, 64_000_000_000):
+        assert work.threads_for(2048, 1024) == 8
+    free["bytes"] = 1
+    assert work.threads_for(2048, 1024) == 1
+
+
+def test_files_are_copied_on_file_systems_without_links(tmp_path, monkeypatch):
+    original = tmp_path / "original.png"
+    original.write_bytes(b"a picture")
+    link, copy = tmp_path / "link", tmp_path / "copy"
+
+    def refuse(*args, **kwargs):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    work.link_or_copy(original, link)
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    work.link_or_copy(link, copy)
+    assert link.is_symlink() and not copy.is_symlink() and not copy.samefile(original)
+    assert copy.read_bytes() == b"a picture"
+
+
+def test_a_full_disk_is_refused(tmp_path, monkeypatch):
+    work.refuse_full(tmp_path)
+    monkeypatch.setattr(work, "MIN_FREE_DISK", 1 << 60)
+    with pytest.raises(OSError, match="MiB is left on its disk: free some space") as refused:
+        work.refuse_full(tmp_path)
+    assert refused.value.errno == errno.ENOSPC

@@ -63,30 +63,29 @@ def test_cache_gives_identical_scenes(tmp_path):
     same(first, generate(options))  # drawn again
 
 
-def test_a_damaged_cache_is_regenerated(tmp_path):
-    options = SyntheticOptions(**TINY)
-    first = generate(options)
-    table = next(tmp_path.rglob("scene.npz"))
-    table.write_bytes(table.read_bytes()[:100])
-    same(first, generate(options))
-    next(tmp_path.rglob("000003.png")).unlink()
-    same(first, generate(options))
+def test_a_damaged_or_changed_cache_is_regenerated(tmp_path):
+    def table():
+        return next(tmp_path.rglob("scene.npz"))
+
+    def invert():
+        pixels = first.train[1].load_pixels().numpy()
+        Image.fromarray(255 - pixels).save(next(tmp_path.rglob("000002.png")))
+
+    def move_points():
+        np.savez_compressed(table(), **(dict(np.load(table())) | {"points": np.zeros((300, 3))}))
+
+    first = generate(options := SyntheticOptions(**TINY))
+    for damage in (
+        lambda: table().write_bytes(table().read_bytes()[:100]),
+        lambda: next(tmp_path.rglob("000003.png")).unlink(),
+        invert,
+        move_points,
+        lambda: table().with_name("sha256").unlink(),
+    ):
+        damage()
+        assert read_cache(options) is None
+        same(first, generate(options))
     assert read_cache(options) is not None
-
-
-def test_a_changed_picture_or_point_in_the_cache_is_not_believed(tmp_path):
-    options = SyntheticOptions(**TINY)
-    first = generate(options)
-    pixels = first.train[1].load_pixels().numpy()
-    Image.fromarray(255 - pixels).save(next(tmp_path.rglob("000002.png")))
-    assert read_cache(options) is None
-    same(first, generate(options))
-    table = next(tmp_path.rglob("scene.npz"))
-    arrays = dict(np.load(table)) | {"points": np.zeros((300, 3))}
-    np.savez_compressed(table, **arrays)
-    same(first, generate(options))
-    next(tmp_path.rglob("scene.npz")).with_name("sha256").unlink()
-    same(first, generate(options))
 
 
 def test_scenes_generate_without_a_writable_cache(tmp_path, monkeypatch):
