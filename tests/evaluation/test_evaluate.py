@@ -1,11 +1,15 @@
 import math
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.tiny_scene import tiny_scene
 
 from padgs.evaluation import evaluate as module
+from padgs.evaluation import scoring
 from padgs.evaluation.evaluate import evaluate, mean_metrics, quantized, score
 from padgs.evaluation.lpips import LpipsUnavailable
 from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
@@ -151,3 +155,16 @@ def test_renders_that_cannot_be_scored(image, pixels):
         evaluate(lambda _: rendering(image), [view("a", None)], PAPER)
     with pytest.raises(ValueError, match="no test views"):
         evaluate(lambda _: rendering(image), [], PAPER)
+
+
+def test_frames_are_timed_in_cpu_time_several_times():
+    seen = []
+
+    def render(view):
+        seen.append(view.name)
+        time.sleep(0.01)
+
+    scene = replace(tiny_scene(), test=tiny_scene().train)
+    times = scoring.frame_times(render, scene)
+    assert [*times] == ["render_ms_min", "render_ms_median"] and times["render_ms_min"] <= times["render_ms_median"] < 5
+    assert seen[1:] == scoring.REPEATS * ["00", "02", "04"], "evenly spread, after a warm-up"

@@ -45,11 +45,8 @@ def test_every_function_is_its_polynomial_up_to_parity():
     assert torch.allclose(backward, forward * parity, atol=1e-12)
 
 
-def test_constant_term_reproduces_the_color():
-    colors = torch.tensor([[0.0, 0.5, 1.0]])
-    assert torch.allclose(0.5 + basis(torch.tensor([0.0, 1.0, 0.0]), 0) * dc_from_colors(colors), colors)
-
-
-def test_unknown_degree():
+def test_constant_term_reproduces_the_color_and_unknown_degrees_are_refused():
     with pytest.raises(ValueError, match="degree is 4"):
         basis(torch.eye(3), 4)
+    colors = torch.tensor([[0.0, 0.5, 1.0]])
+    assert torch.allclose(0.5 + basis(torch.tensor([0.0, 1.0, 0.0]), 0) * dc_from_colors(colors), colors)

@@ -15,10 +15,11 @@ from padgs.render.backends import cpu as cpu_backend
 from padgs.scene import View
 
 
+@pytest.mark.parametrize("options", [RenderOptions("ray"), options_of("ray", 3)], ids=["sorted", "hybrid"])
 @each_native_engine
-def test_repeated_backward_is_equal(backend: str, generator: torch.Generator):
+def test_repeated_backward_is_equal(backend: str, options: RenderOptions, generator: torch.Generator):
     inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
-    rendering = render(inputs, View("v", identity_pose(), 40, 20), options_of("ray", 3), backend=backend)
+    rendering = render(inputs, View("v", identity_pose(), 40, 20), options, backend=backend)
     loss = rendering.image.square().sum() + rendering.depth.sum()
     first, second = (torch.autograd.grad(loss, [*vars(inputs).values()], retain_graph=True) for _ in range(2))
     assert all(torch.equal(*pair) and pair[0].any() for pair in zip(first, second, strict=True))

@@ -20,7 +20,6 @@ from support.render_cases import (
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
-from padgs.geometry.panorama import sample
 from padgs.render import RenderOptions, render
 from padgs.render.backends.native import native_rays
 
@@ -75,22 +74,6 @@ def test_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype:
         expected = picture(gaussians, table, projection, backend=backend, dtype=dtype)
         limit = 1e-6 if dtype == torch.float64 else 5e-5  # R itself is orthonormal to float32 only
         assert (turned - expected)[stable].abs().max() <= limit
-
-
-@each_free
-@each_engine
-def test_a_turned_panorama_is_the_old_one_resampled(projection: str, backend: str, dtype: torch.dtype):
-    generator = torch.Generator().manual_seed(33)
-    gaussians = gaussians_of("ordinary", 25, generator)
-    broad = Gaussians(**{**vars(gaussians), "scales": gaussians.scales.clamp(min=0.1)})
-    panorama = Panorama(300, 150)
-    old = picture(broad, panorama, projection, backend=backend, dtype=dtype)
-    for _ in range(3):
-        pose = random_pose(generator)
-        turned = picture(broad, panorama, projection, backend=backend, dtype=dtype, pose=pose)
-        expected = sample(old, panorama.rays(dtype=dtype) @ pose[:3, :3].to(dtype))
-        # The cut at 1/255 is an edge, which interpolation blurs.
-        assert -10 * torch.log10(((turned - expected) ** 2).mean()) >= 50
 
 
 @each_engine

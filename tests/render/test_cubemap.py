@@ -8,13 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 from support.render_cases import (
-    INPUTS,
     differentiated,
     draw,
     each_engine,
     gaussians_of,
     identity_pose,
-    leaves,
     mixture,
     needs_native,
     random_pose,
@@ -195,41 +193,6 @@ def test_native_faces_are_complete_and_efficient(projection: str, generator):
         for how in (options, replace(options, cubemap=True, face_size=163))  # as fine as the horizon
     )
     assert faces < 1.6 * whole  # 1.3, as faces are finer towards their edges; whole faces in vain made it 15
-
-
-@pytest.mark.parametrize("projection", PROJECTIONS)
-def test_gradients_match_differences(projection: str, generator):
-    """Gradients by all inputs and the pose against central differences in float64, away from cuts."""
-    count = 4
-    radius = torch.tensor([[2.5], [3.0], [3.5], [4.0]], dtype=torch.float64)  # apart: the order stays
-    gaussians = Gaussians(
-        means=radius * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator).double(), dim=-1),
-        quats=torch.randn(count, 4, generator=generator, dtype=torch.float64),
-        scales=0.4 + 0.4 * torch.rand(count, 3, generator=generator, dtype=torch.float64),
-        opacities=0.4 + 0.2 * torch.rand(count, generator=generator, dtype=torch.float64),
-        colors=torch.rand(count, 3, generator=generator, dtype=torch.float64),
-    )
-    inputs, pose = leaves(gaussians, torch.float64), identity_pose().requires_grad_()
-    mean_offsets = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
-    variables = {**vars(inputs), "pose": pose, "mean_offsets": mean_offsets}
-    weight = torch.rand(6, 12, 5, generator=generator, dtype=torch.float64)
-    options = RenderOptions(projection=projection, cubemap=True)
-
-    def value(changed: dict) -> torch.Tensor:
-        drawn = Gaussians(**{name: changed[name] for name in INPUTS})
-        rendering = render(drawn, View("v", changed["pose"], 12, 6), options, mean_offsets=changed["mean_offsets"])
-        outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
-        return (outputs * weight).sum()
-
-    gradients = torch.autograd.grad(value(variables), list(variables.values()))
-    for (name, variable), gradient in zip(variables.items(), gradients, strict=True):
-        step = 1e-6 * torch.randn(variable.shape, generator=generator, dtype=torch.float64)
-        if name == "pose":
-            step[3] = 0
-        with torch.no_grad():
-            slope = value({**variables, name: variable + step}) - value({**variables, name: variable - step})
-        assert slope.abs() > 1e-9, name
-        assert (gradient * step).sum().item() * 2 == pytest.approx(slope.item(), rel=1e-4), name
 
 
 @each_engine

@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.render_cases import (
     KINDS,
+    blended,
     chosen,
     draw,
     each_engine,
@@ -122,16 +123,17 @@ def test_input_order_does_not_matter(projection, lens, backend, dtype):
     assert torch.equal(rendering.visible, reference.visible[permutation])
 
 
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @each_setup
 @each_engine
-def test_ties_keep_the_input_order(projection, lens, backend, dtype):
+def test_ties_keep_the_input_order(projection, lens, blending, backend, dtype):
     def ball(color: tuple[float, float, float]) -> Gaussians:
         row = ((0.1, 0, 2), (1.0, 0, 0, 0), (0.5, 0.5, 0.5), 0.95, color)
         return Gaussians(*(torch.tensor([value], dtype=torch.float64) for value in row))
 
     red, blue = ball((1, 0, 0)), ball((0, 0, 1))
     for first, second, channel in ((red, blue, 0), (blue, red, 2)):
-        options = RenderOptions(projection)
+        options = RenderOptions(projection, **blended(blending, 2))
         image = draw(joined(first, second), 64, 32, lens=lens, backend=backend, dtype=dtype, options=options).image
         row, column = divmod(int(image.sum(-1).argmax()), 64)
         assert image[row, column, channel] > 0.8 and image[row, column, 2 - channel] < 0.15

@@ -119,8 +119,17 @@ def test_memory_is_bounded_by_the_block(generator: torch.Generator, monkeypatch:
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
-@pytest.mark.parametrize(("projection", "wrap"), [("erp", True), ("erp", False), ("tangent", True), ("ray", True)])
-def test_gradcheck(output: str, projection: str, wrap: bool):
+@pytest.mark.parametrize(
+    "options",
+    [
+        RenderOptions("erp"),
+        RenderOptions("erp", wrap=False),
+        *(RenderOptions(projection) for projection in ("tangent", "ray")),
+        *(RenderOptions(projection, cubemap=True) for projection in ("pinhole", "tangent", "ray")),
+    ],
+    ids=str,
+)
+def test_gradcheck(output: str, options: RenderOptions):
     """Jacobians of all outputs against differences in float64."""
     gaussians = gaussians_of("seam", 3, torch.Generator().manual_seed(21))
     inputs = leaves(gaussians, torch.float64)
@@ -133,7 +142,7 @@ def test_gradcheck(output: str, projection: str, wrap: bool):
         rendering = render(
             Gaussians(means, quats, scales, opacities, colors),
             View("v", moved, 12, 6),
-            RenderOptions(projection, wrap=wrap),
+            options,
             background=background,
             mean_offsets=mean_offsets,
             backend="torch",

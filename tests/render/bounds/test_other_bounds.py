@@ -1,4 +1,4 @@
-"""Published bounds: instances of the released OmniGS and OP43DGS."""
+"""Published bounds (instances of the released OmniGS and OP43DGS), bounds of ray tables that are nearly panoramas."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ import math
 import pytest
 import torch
 from support.native_tiles import NativeTiles
-from support.render_cases import identity_pose, needs_native, projected
+from support.render_cases import identity_pose, mixture, needs_native, projected, random_pose, view_of
 
 from padgs.gaussians import Gaussians
-from padgs.geometry.camera import Panorama
-from padgs.render import RenderOptions
+from padgs.geometry.camera import Panorama, RayTable
+from padgs.geometry.lens import axis_direction, bend
+from padgs.render import RenderOptions, render
+from padgs.render.backends.native import native_camera
 from padgs.render.projection import TILE
 
 OMNIGS = RenderOptions("erp", near=0.2, wrap=False, bounds="square")
 EXACT = RenderOptions("tangent", near=0.2)
+RAY = RenderOptions("ray")
 # Tiles of a Gaussian, on average, as another program measured them with the released code's formulas.
 DISTANCES = (1, 3, 10, 30, 100)
 PUBLISHED = (11, 34, 362, 1432, 3772)
@@ -83,3 +86,38 @@ def test_extents_of_the_released_op43dgs_depend_on_the_unit(scale: float):
     at_home = tiles_each(10, op43dgs(512), 512)
     grown = tiles_each(10 * scale, op43dgs(512, near=0.0), 512)
     assert grown > 4 * at_home if scale > 1 else grown < at_home / 4
+
+
+def bent(width: int, height: int, k1: float, axis: str = "z") -> RayTable:
+    panorama = Panorama(width, height)
+    rays = bend(panorama.rays(dtype=torch.float64), axis_direction(axis), torch.tensor([k1], dtype=torch.float64))
+    return RayTable(rays.float(), panorama.focal)
+
+
+@needs_native
+@pytest.mark.parametrize("projection", ["ray", "tangent"])
+@pytest.mark.parametrize("axis", "xz")
+@pytest.mark.parametrize("k1", [-0.009, 0.009])
+def test_bounds_around_a_bent_panorama_lose_nothing(k1, axis, projection):
+    generator = torch.Generator().manual_seed(41)
+    table = bent(160, 80, k1, axis)
+    for _ in range(2):
+        gaussians, view = mixture(6, generator).to(torch.float32), view_of(table, random_pose(generator))
+        drawn = render(gaussians, view, RenderOptions(projection), backend="cpu")
+        upside = RayTable(-table.table, table.focal)  # far off any panorama: without bounds
+        flip = torch.eye(4, dtype=torch.float64)
+        flip[:3, :3] *= -1  # a point reflection of world and rays changes nothing
+        assert native_camera(flip, upside, RAY).off_panorama < 0
+        assert 0 <= native_camera(flip, table, RAY).off_panorama < 0.3
+        truth = render(gaussians.to(torch.float64), view, RenderOptions(projection), backend="torch")
+        assert drawn.counters["contributing"] >= 0.998 * truth.counters["contributing"]
+        assert ((drawn.image - truth.image).abs().amax(-1) > 1e-3).double().mean() < 0.002  # decisions at 1/255
+
+
+@needs_native
+def test_bounds_of_a_bent_panorama_are_tight():
+    generator = torch.Generator().manual_seed(42)
+    gaussians = mixture(40, generator).to(torch.float32)
+    plain = render(gaussians, view_of(Panorama(256, 128)), RAY, backend="cpu").counters
+    table = render(gaussians, view_of(bent(256, 128, 0.003)), RAY, backend="cpu").counters
+    assert table["instances"] < 2 * plain["instances"]
