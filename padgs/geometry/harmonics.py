@@ -31,13 +31,8 @@ def basis(directions: Tensor, degree: int) -> Tensor:
         values += [-c * y, c * z, -c * x]
     if degree >= 2:
         c = math.sqrt(15 / (4 * math.pi))
-        values += [
-            c * x * y,
-            -c * y * z,
-            math.sqrt(5 / (16 * math.pi)) * (2 * zz - xx - yy),
-            -c * x * z,
-            0.5 * c * (xx - yy),
-        ]
+        middle = math.sqrt(5 / (16 * math.pi))
+        values += [c * x * y, -c * y * z, middle * (2 * zz - xx - yy), -c * x * z, 0.5 * c * (xx - yy)]
     if degree >= 3:
         outer, inner = math.sqrt(35 / (32 * math.pi)), math.sqrt(21 / (32 * math.pi))
         middle = math.sqrt(105 / (4 * math.pi))

@@ -9,7 +9,7 @@ import torch
 
 from padgs.native import abi
 from padgs.native.abi import Int32, Int64, Pointer
-from padgs.native.loading import Library, declare, find_library
+from padgs.native.loading import Library, declare, find_library, succeeds
 
 STRUCTURES = (
     *(abi.NativeCamera, abi.Inputs, abi.Gradients, abi.BlendGradientArguments, abi.DecodeGradientArguments),
@@ -17,6 +17,9 @@ STRUCTURES = (
     abi.AngularSizeArguments,
 )
 SIGNATURES = {
+    **dict.fromkeys(("padgs_blend_forward", "padgs_blend_backward", "padgs_leave_one_out"), ([Pointer], None)),
+    **dict.fromkeys(("padgs_decode_select", "padgs_decode_place", "padgs_decode_backward"), ([Pointer], None)),
+    "padgs_splats": ([Pointer], None),
     "padgs_isa": ([], ctypes.c_char_p),
     "padgs_structure_bytes": ([Int32], Int64),
     "padgs_project": ([Pointer] * 4, None),
@@ -27,13 +30,6 @@ SIGNATURES = {
     "padgs_bin": ([Pointer, Int64, Pointer, Int64, *[Pointer] * 4], None),
     "padgs_sum_moments": ([Pointer, Pointer, Int64, Pointer], None),
     "padgs_core_words": ([Pointer], Int64),
-    "padgs_blend_forward": ([Pointer], None),
-    "padgs_blend_backward": ([Pointer], None),
-    "padgs_leave_one_out": ([Pointer], None),
-    "padgs_decode_select": ([Pointer], None),
-    "padgs_decode_place": ([Pointer], None),
-    "padgs_decode_backward": ([Pointer], None),
-    "padgs_splats": ([Pointer], None),
     "padgs_angular_size": ([Pointer], ctypes.c_double),
     "padgs_photometric_loss": ([Pointer], ctypes.c_double),
     "padgs_loss_workspace": ([Int32, Int32], Int64),
@@ -46,22 +42,14 @@ SIGNATURES = {
 
 @functools.cache
 def library() -> Library:
-    """Return the loaded CPU library.
-
-    Raises:
-        OSError: it was not built (no compiler at install time), does not load, or was built from other sources.
-    """
+    """Return the loaded CPU library; OSError if it is missing, does not load, or is of other sources."""
     return declare(find_library("padgs_cpu", "a C++ compiler"), SIGNATURES, "padgs_structure_bytes", STRUCTURES)
 
 
 @functools.cache
 def available() -> bool:
     """Return whether the native CPU library is built and loads."""
-    try:
-        library()
-    except OSError:
-        return False
-    return True
+    return succeeds(library)
 
 
 def works_on(_: torch.device) -> bool:

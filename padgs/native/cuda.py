@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.native import abi
 from padgs.native.abi import Int32, Int64, Pointer, fields
-from padgs.native.loading import Library, declare, find_library
+from padgs.native.loading import Library, declare, find_library, succeeds
 
 OUT_OF_MEMORY = 2  # cudaErrorMemoryAllocation
 NOT_COMPILED_FOR = (98, 209, 222)  # no such kernel, no image for this device, PTX newer than the driver
@@ -131,6 +131,10 @@ STRUCTURES = (
     *(BlendGradientInputs, RemovalInputs, DeviceLossArguments, DeviceSplatArguments, DeviceDecodeArguments),
     *(DeviceDecodeGradientArguments, NetworkInputs, NetworkArguments, NetworkGradientArguments),
 )
+CALLS = (  # that take a queue and a structure
+    *("project", "sort", "blend", "blend_backward", "leave_one_out", "project_backward", "splats", "decode_place"),
+    *("decode_take_back", "networks_opacity", "networks_attributes", "networks_backward", "photometric_loss"),
+)
 SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
     "padgs_cuda_device_type": ([], ctypes.c_char_p),
@@ -140,34 +144,17 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_error": ([Int32], ctypes.c_char_p),
     "padgs_cuda_scratch_bytes": ([Pointer, Int64], Int64),
     "padgs_cuda_pose_blocks": ([Int64], Int64),
-    "padgs_cuda_project": ([Pointer, Pointer], Int32),
-    "padgs_cuda_sort": ([Pointer, Pointer], Int32),
     "padgs_cuda_bin": ([Pointer, Pointer, Int32], Int32),
-    "padgs_cuda_blend": ([Pointer, Pointer], Int32),
-    "padgs_cuda_blend_backward": ([Pointer, Pointer], Int32),
-    "padgs_cuda_leave_one_out": ([Pointer, Pointer], Int32),
-    "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
-    "padgs_cuda_splats": ([Pointer, Pointer], Int32),
-    "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
-    "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),
     "padgs_cuda_networks_fit": ([Pointer, Int32, Int32, Int32, Int32], Int32),
-    "padgs_cuda_networks_opacity": ([Pointer, Pointer], Int32),
-    "padgs_cuda_networks_attributes": ([Pointer, Pointer], Int32),
     "padgs_cuda_networks_blocks": ([Int64], Int64),
-    "padgs_cuda_networks_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_loss_blocks": ([Int32, Int32], Int64),
-    "padgs_cuda_photometric_loss": ([Pointer, Pointer], Int32),
+    **{f"padgs_cuda_{name}": ([Pointer, Pointer], Int32) for name in CALLS},
 }
 
 
 @functools.cache
 def library() -> Library:
-    """Return the loaded library.
-
-    Raises:
-        OSError: it was not built (no nvcc at install time), does not load, was built from other sources, or by a
-            compiler that is too new for the driver.
-    """
+    """Return the loaded library; OSError if it is missing, does not load, or does not fit its callers or the driver."""
     loaded = declare(find_library("padgs_cuda", "nvcc and a GPU"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
     refuse_old_driver(loaded)
     return loaded
@@ -188,29 +175,16 @@ def refuse_old_driver(loaded: Library) -> None:
 @functools.cache
 def available() -> bool:
     """Return whether the library is built, loads and fits the driver, with or without a GPU that can run it."""
-    try:
-        library()
-    except OSError:
-        return False
-    return True
+    return succeeds(library)
 
 
 def works_on(device: torch.device) -> bool:
     """Return whether the library is available and was compiled for this GPU."""
-    try:
-        require(device)
-    except (OSError, RuntimeError):
-        return False
-    return True
+    return succeeds(lambda: require(device))
 
 
 def require(device: torch.device) -> None:
-    """Raise an error if nothing can be rendered on this device.
-
-    Raises:
-        OSError: as `library` does.
-        RuntimeError: as `queue` does.
-    """
+    """Raise OSError or RuntimeError, as `library` and `queue` do, if nothing can be rendered on this device."""
     library()
     queue(device)
 
@@ -221,11 +195,7 @@ def device_type() -> str:
 
 
 def queue(device: torch.device) -> Queue:
-    """Return the current torch stream of a device, after checking that the kernels can run there.
-
-    Raises:
-        RuntimeError: the library was not compiled for this device, or the device does not answer.
-    """
+    """Return the current torch stream of a device; RuntimeError if the kernels cannot run there."""
     if device.type != "cuda":
         return Queue(0, None)
     index = torch.cuda.current_device() if device.index is None else device.index
@@ -235,11 +205,7 @@ def queue(device: torch.device) -> Queue:
 
 @functools.cache
 def check_device(index: int) -> None:
-    """Launch an empty kernel, once for each device.
-
-    Raises:
-        RuntimeError: as `queue` does.
-    """
+    """Launch an empty kernel, once for each device; RuntimeError if it cannot run."""
     code = library().padgs_cuda_check(ctypes.byref(Queue(index, None)))
     if code in NOT_COMPILED_FOR:
         major, minor = torch.cuda.get_device_capability(index)
@@ -252,11 +218,9 @@ def check_device(index: int) -> None:
 
 
 def call(name: str, where: Queue, *arguments: Any) -> None:
-    """Call a function of the library that returns a cudaError_t; structures are passed by reference.
+    """Call a function that returns a cudaError_t, which is raised; structures are passed by reference.
 
-    Raises:
-        torch.cuda.OutOfMemoryError: the device has no memory left.
-        RuntimeError: any other CUDA error; errors of kernels may be reported later than they happen.
+    Errors of kernels may be reported later than they happen.
     """
     references = (ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments)
     raise_for(getattr(library(), name)(ctypes.byref(where), *references), name)

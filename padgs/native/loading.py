@@ -47,11 +47,7 @@ class Library:
 
 
 def find_library(stem: str, requirement: str) -> ctypes.CDLL:
-    """Load lib`stem` from this package, or from the folder PADGS_LIBRARY_DIR for work on the kernels.
-
-    Raises:
-        OSError: it is missing, because there was no `requirement` when padgs was installed, or does not load.
-    """
+    """Load lib`stem` from this package, or from PADGS_LIBRARY_DIR; OSError if it is missing or does not load."""
     suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
     name = ("" if sys.platform == "win32" else "lib") + stem + suffix
     folders = [Path(folder) for folder in _package_folders()]
@@ -66,6 +62,15 @@ def find_library(stem: str, requirement: str) -> ctypes.CDLL:
     )
 
 
+def succeeds(load: Callable[[], object]) -> bool:
+    """Return whether a library can be loaded and used, as `load` does."""
+    try:
+        load()
+    except (OSError, RuntimeError):
+        return False
+    return True
+
+
 def _package_folders() -> list[str]:
     spec = importlib.util.find_spec("padgs.native")
     return list(spec.submodule_search_locations or []) if spec else []
@@ -74,11 +79,7 @@ def _package_folders() -> list[str]:
 def declare(
     loaded: ctypes.CDLL, signatures: Mapping[str, tuple[list, Any]], bytes_of: str, structures: Sequence[type]
 ) -> Library:
-    """Set the types of the functions of a library after checking that it has this version.
-
-    Raises:
-        OSError: a function is missing, or a structure of the library has another size.
-    """
+    """Set the types of a library's functions; OSError if a function is missing, or a structure has another size."""
     for name, (arguments, result) in signatures.items():
         if not hasattr(loaded, name):
             raise OSError(f"{loaded._name} is of another version, without {name}; build it again")

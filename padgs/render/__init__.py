@@ -89,11 +89,7 @@ def make_request(
     mean_offsets: Tensor | None = None,
     absgrad: Tensor | None = None,
 ) -> Request:
-    """Return the input of a backend for the arguments of `render`.
-
-    Raises:
-        ValueError: the arguments break the contract.
-    """
+    """Return the input of a backend for the arguments of `render`; ValueError if they break the contract."""
     means = gaussians.means
     cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
     if background is None:

@@ -191,11 +191,7 @@ def check_inputs(request: Request) -> None:
 
 
 def check_camera(camera: Camera, options: RenderOptions) -> None:
-    """Refuse a camera that these options cannot render.
-
-    Raises:
-        ValueError: it has no pixels, or the projection or the bounds do not support it.
-    """
+    """Refuse by ValueError a camera without pixels, or one that the projection or the bounds do not support."""
     if isinstance(camera, RayTable) and (camera.table.ndim != 3 or camera.table.shape[2] != 3):
         raise ValueError(f"the ray table has shape {tuple(camera.table.shape)}; it must be (height, width, 3)")
     if camera.width < 1 or camera.height < 1:

@@ -42,13 +42,8 @@ def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
     """Return the camera of all six faces: 90 degrees, and at least a pixel more at each border.
 
     A bilinear sample at the edge of a face needs the pixel beyond it; because the same face renders that pixel,
-    neighbouring faces differ by interpolation alone.
-
-    Args:
-        panorama: the panorama to resample to.
-        face_size: pixels across 90 degrees. If not given, the centre of a face has `FINENESS` times the pixels per
-            radian of the panorama, W / 2 pi or H / pi, the larger. With the same resolution, W / pi pixels across,
-            interpolation would blur (docs/renderer.md).
+    neighbouring faces differ by interpolation alone. Without `face_size`, pixels across 90 degrees, the centre of a
+    face has `FINENESS` times the pixels per radian of the panorama; with as many, interpolation would blur.
     """
     focal = FINENESS * max(panorama.width / (2 * pi), panorama.height / pi) if face_size is None else face_size / 2
     size = 2 * (ceil(focal) + 1)

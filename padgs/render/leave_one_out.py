@@ -47,16 +47,9 @@ def leave_one_out(
 
     Hybrid blending is scored as if it were sorted, and a cubemap as a panorama by rays; these scores are estimates.
 
-    Args:
-        gaussians: N Gaussians.
-        view: pose and image size.
-        target: [H, W, 3], the ground truth.
-        weight: [H, W] or [H, 1] of the pixels, >= 0 and not all 0; only ratios matter.
-        options: as for `padgs.render.render`.
-        backend: as for `padgs.render.render`; auto scores tensors of a GPU on the CPU if the library for it is missing.
-
-    Raises:
-        ValueError: unknown backend, a target of another size than the view, or inputs that break the contract.
+    `target` [H, W, 3] is the ground truth; only ratios of the pixels' weights [H, W] or [H, 1] >= 0 matter. With
+    backend auto, tensors of a GPU are scored on the CPU if the library for it is missing. Raises ValueError as
+    `padgs.render.render` does, and for a target of another size than the view.
     """
     device, resolved = gaussians.means.device, resolve_backend(backend, gaussians.means)
     if backend == "auto" and resolved == "torch" and device.type != "cpu":

@@ -244,12 +244,7 @@ def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tens
 def square_boxes(centers: Tensor, middle: Tensor, determinant: Tensor) -> Tensor:
     """Return the pixels [N, 4] of `bounds=square`, as published: 3 sigma of the longest axis, in whole tiles.
 
-    Args:
-        centers: [N, 2] (u, v) pixels.
-        middle, determinant: [N] half the trace, and the determinant, of the covariance in square pixels.
-
-    Returns:
-        first column, end column, first row, end row of each Gaussian.
+    Centers [N, 2] are pixels, `middle` and `determinant` [N] half the trace and the determinant of the covariance.
     """
     longest = middle + torch.sqrt((middle * middle - determinant).clamp(min=0.1))
     radius = torch.ceil(3 * torch.sqrt(longest))[:, None]

@@ -12,7 +12,7 @@ from math import pi
 import torch
 from torch import Tensor
 
-from padgs.geometry.camera import Camera, Panorama
+from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.projection import (
@@ -91,7 +91,8 @@ def project_tangent(request: Request) -> TangentFootprints:
     camera, options = request.camera, request.options
     means, orientations = camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _shifted(means, request.mean_offsets)
+    if request.mean_offsets is not None:
+        means = means + mean_shift(means, request.mean_offsets)
     low_pass = low_pass_of(options, camera)
     gaussians, low_pass = low_pass_filtered(request.gaussians, means, low_pass), low_pass.in_plane
     radius = means.norm(dim=-1)
@@ -105,11 +106,11 @@ def project_tangent(request: Request) -> TangentFootprints:
     second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) / torch.sqrt(determinant / var_0)[:, None]
     whitening = torch.stack((first, second), dim=-2)
     visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & is_sound(determinant)
-    boxes = None
+    boxes, rays = None, camera.rays(dtype=means.dtype, device=means.device)
     if options.bounds == "square" and isinstance(camera, Panorama):
         boxes = tangent_boxes(means.detach(), spread.detach(), determinant.detach(), low_pass, camera)
         visible &= is_on_image(boxes, camera.width, camera.height)
-    return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, _rays(camera, means))
+    return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, rays)
 
 
 def project_ray(request: Request) -> RayFootprints:
@@ -121,7 +122,8 @@ def project_ray(request: Request) -> RayFootprints:
     camera, options = request.camera, request.options
     means, orientations = camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _shifted(means, request.mean_offsets)
+    if request.mean_offsets is not None:
+        means = means + mean_shift(means, request.mean_offsets)
     gaussians = low_pass_filtered(request.gaussians, means, low_pass_of(options, camera))
     radius, opacities = means.norm(dim=-1), gaussians.opacities
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
@@ -133,7 +135,8 @@ def project_ray(request: Request) -> RayFootprints:
         along = ((orientations * gaussians.scales[:, None, :]).mT @ (means / radius[:, None])[..., None]).detach()
         outside &= radius.detach() - torch.sqrt(largest * (along[..., 0] ** 2).sum(-1)) > options.near
     visible = in_front & drawn & outside & torch.isfinite(distance)  # else float overflows or nothing spreads
-    return RayFootprints(opacities, radius, visible, None, means, whitening, _rays(camera, means), options.near)
+    rays = camera.rays(dtype=means.dtype, device=means.device)
+    return RayFootprints(opacities, radius, visible, None, means, whitening, rays, options.near)
 
 
 def mean_shift(means: Tensor, mean_offsets: Tensor) -> Tensor:
@@ -145,10 +148,6 @@ def mean_shift(means: Tensor, mean_offsets: Tensor) -> Tensor:
     return mean_offsets[:, :1] * pi * east + mean_offsets[:, 1:] * (pi / 2) * down
 
 
-def _shifted(means: Tensor, mean_offsets: Tensor | None) -> Tensor:
-    return means if mean_offsets is None else means + mean_shift(means, mean_offsets)
-
-
 def _tangent_basis(normals: Tensor) -> Tensor:
     """Return two arbitrary orthonormal rows [N, 2, 3] orthogonal to each normal."""
     axis = torch.nn.functional.one_hot(normals.abs().argmin(-1), 3).to(normals)
@@ -156,23 +155,13 @@ def _tangent_basis(normals: Tensor) -> Tensor:
     return torch.stack((first, torch.linalg.cross(normals, first)), dim=-2)
 
 
-def _rays(camera: Camera, like: Tensor) -> Tensor:
-    return camera.rays(dtype=like.dtype, device=like.device)
-
-
 def tangent_boxes(means: Tensor, spread: Tensor, determinant: Tensor, low_pass: float, camera: Panorama) -> Tensor:
     """Return the pixels [N, 4] that the released OP43DGS renders; they grow with the distance of a mean, in any units.
 
     It computes the radius from the trace of the footprint in the panorama, by a Jacobian whose lower row is divided by
     sqrt(x^2 + z^2 r^2) instead of r^2 sqrt(x^2 + z^2), and the determinant of the footprint on a tangent plane of 512
-    pixels per radian.
-
-    Args:
-        means: [N, 3] camera frame, world units.
-        spread: [N, 3, 3] A with Sigma = A A^T.
-        determinant: [N] of the covariance on the tangent plane with its low-pass, in square radians.
-        low_pass: its variance, square radians.
-        camera: the panorama.
+    pixels per radian. Means [N, 3] are in the camera frame, the covariance is A A^T for `spread` [N, 3, 3] A, and
+    `determinant` [N] and `low_pass` are those on the tangent plane in (square) square radians.
     """
     x, y, z = means.unbind(-1)
     right = (x * x + y * y + z * z) * torch.sqrt(x * x + z * z)

@@ -75,14 +75,8 @@ def measure_all(
 ) -> dict[str, Any]:
     """Measure and return the report described above.
 
-    Args:
-        options: sizes, device and repeats.
-        progress: called with what is being measured.
-        file: for the report as JSON; also written after each size, so that a time limit loses little.
-
-    Raises:
-        OSError: the native library of the CPU is missing, or the file cannot be written.
-        ValueError: the device is a GPU, and torch finds none.
+    `progress` is called with what is being measured. The report is written to `file`, if given, after each size, too:
+    a time limit then loses little. Raises OSError without the native library, and ValueError without the GPU.
     """
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():

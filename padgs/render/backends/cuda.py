@@ -100,15 +100,10 @@ class DeviceProjected(Strips[DeviceStrip]):
     def __init__(
         self, camera: NativeCamera, pose: Tensor, inputs: Inputs, max_instances: int, *, capacity: int = 0
     ) -> None:
-        """Project, sort, count; waits for the device once, unless a capacity is given.
+        """Project by `pose` [4, 4] on the device (that of the camera is not used), sort and count.
 
-        Args:
-            camera: its own pose is not used.
-            pose: [4, 4] on the device, contiguous.
-            inputs: on the device.
-            max_instances: of a strip.
-            capacity: number of instances to allocate in a single strip without reading their number back; `counts`
-                holds it on the device. 0: allocate the exact number.
+        With a capacity, a single strip has room for so many instances, and `counts` holds their number on the device;
+        with 0, the device is waited for once, and memory has the exact size.
         """
         device, count = pose.device, inputs.count
         self.queue = cuda.queue(device)

@@ -213,11 +213,7 @@ def strip_cuts(per_row: list[int], max_instances: int) -> list[int]:
 
 
 def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> NativeCamera:
-    """Return pose, camera and options in one structure.
-
-    Raises:
-        ValueError: the library does not know the projection.
-    """
+    """Return pose, camera and options in one structure; ValueError for an unknown projection."""
     if options.projection not in PROJECTIONS:
         raise ValueError(
             f"the native libraries do not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"

@@ -151,13 +151,9 @@ def with_absgrad(q: Tensor, slope: Tensor, absgrad: Tensor) -> Tensor:
     """Return q; the backward pass sets the gradient of `absgrad` to the absolute positional gradient.
 
     The gradient of a mean is a sum over pixels, in which opposite gradients of a Gaussian that should be split cancel.
-    The absolute one is the sum of norms, sum over pixels p of |dL/dq_p| |dq_p/dmean|. AbsGS and Gaussian Opacity Fields
-    sum absolute values of each image coordinate instead; norms do not depend on the axes.
-
-    Args:
-        q: [P, K] squared distances of pixels and Gaussians.
-        slope: [P, K] |dq/dmean| without gradient, per world unit.
-        absgrad: [K], any values.
+    The absolute one is the sum of norms, sum over pixels p of |dL/dq_p| |dq_p/dmean|, of the slopes [P, K] per world
+    unit. AbsGS and Gaussian Opacity Fields sum absolute values of each image coordinate instead; norms do not depend on
+    the axes.
     """
     return _WithAbsgrad.apply(q, slope, absgrad)
 
