@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.render_cases import INPUTS, engines, needs_native, view_of
+from support.render_cases import INPUTS, engines, view_of
 
 from padgs.gaussians import Gaussians
-from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.render import RenderOptions, render
 from padgs.render.projection import PROJECTIONS, SLOPE_LIMIT
 
@@ -64,25 +64,9 @@ def cases_on_engines() -> list:
 
 @pytest.mark.parametrize(("case", "backend", "dtype"), cases_on_engines())
 def test_golden_case(case: str, backend: str, dtype: torch.dtype):
-    data, meta = load(case)
-    check_case(data, meta, camera_of(meta), backend, dtype)
-
-
-@pytest.mark.parametrize("case", [case for case in CASES if case.startswith(("tangent", "ray"))])
-@needs_native
-def test_golden_case_through_a_table_of_rays(case: str):
-    """Replace the formula of the camera by its rays."""
-    data, meta = load(case)
-    panorama = camera_of(meta)
-    check_case(data, meta, RayTable(panorama.rays(), panorama.focal), "cpu", torch.float32)
-
-
-def load(case: str) -> tuple[dict, dict]:
     data = np.load(FOLDER / f"{case}.npz")
-    return data, json.loads(str(data["meta"]))
+    meta = json.loads(str(data["meta"]))
 
-
-def check_case(data: dict, meta: dict, camera: Camera, backend: str, dtype: torch.dtype) -> None:
     def tensor(key: str) -> torch.Tensor:
         return torch.tensor(data[key], dtype=dtype)
 
@@ -90,7 +74,7 @@ def check_case(data: dict, meta: dict, camera: Camera, backend: str, dtype: torc
     pose = torch.eye(4, dtype=dtype)
     pose[:3, :3], pose[:3, 3] = tensor("R"), tensor("t")
     arguments = {"background": tensor("background"), "backend": backend}
-    rendering = render(Gaussians(**inputs), view_of(camera, pose), options_of(meta), **arguments)
+    rendering = render(Gaussians(**inputs), view_of(camera_of(meta), pose), options_of(meta), **arguments)
 
     stable = torch.tensor(data["stable"])
     for name in ("image", "transmittance"):

@@ -105,9 +105,7 @@ def test_images_match_the_published_procedure(projection: str, size: int, backen
     assert abs(rendering.counters["contributing"] - contributing) <= int((alpha[~stable] > 0).sum())
 
 
-def assert_native_matches(
-    gaussians: Gaussians, camera: Camera, options: RenderOptions, generator: torch.Generator, backend: str
-) -> None:
+def assert_native_matches(gaussians: Gaussians, camera: Camera, options: RenderOptions, generator, backend: str):
     *_, stable = fragments(gaussians, camera, options, identity_pose())
     stable = stable.view(camera.height, camera.width)
     assert stable.double().mean() > 0.6
@@ -260,19 +258,18 @@ def test_weights_and_transmittance_sum_to_one(generator: torch.Generator):
     sums = weights.sum(-1) + left
     torch.testing.assert_close(sums[~covered], torch.ones_like(sums[~covered]), rtol=1e-12, atol=0)
     assert ((sums[covered] > 1 - 1e-4) & (sums[covered] <= 1)).all()
+    for nothing in (torch.zeros(3, 0), torch.zeros(3, 2)):
+        weights, left = hybrid_weights(nothing, nothing + 1, 16)
+        assert not weights.any() and torch.equal(left, torch.ones(3))
 
 
-def test_nothing_lies_behind_a_core_that_ends_early():
+def test_the_tail_lies_behind_the_core_and_nothing_behind_one_that_ends_early():
     alpha = torch.tensor([[0.9, 0.95, 0.99, 0.5, 0.03]], dtype=torch.float64)
     weights, left = hybrid_weights(alpha, torch.tensor([[1.0, 2.0, 3.0, 4.0, 0.5]], dtype=torch.float64), 16)
     torch.testing.assert_close(weights, torch.tensor([[0.9, 0.095, 0.00495, 0.0, 0.0]], dtype=torch.float64))
     assert left.item() == 0
-
-
-def test_the_tail_lies_behind_the_core():
-    near_fog = hybrid_weights(torch.tensor([[0.04, 0.5]]), torch.tensor([[1.0, 2.0]]), 16)
-    far_fog = hybrid_weights(torch.tensor([[0.04, 0.5]]), torch.tensor([[3.0, 2.0]]), 16)
-    for weights, left in (near_fog, far_fog):
+    for distance in (1.0, 3.0):  # of the fog
+        weights, left = hybrid_weights(torch.tensor([[0.04, 0.5]]), torch.tensor([[distance, 2.0]]), 16)
         torch.testing.assert_close(weights, torch.tensor([[0.02, 0.5]]))
         torch.testing.assert_close(left, torch.tensor([0.48]))
 
@@ -287,10 +284,3 @@ def test_derivatives_match_differences(size: int, generator: torch.Generator):
         return hybrid_weights(torch.where(drawn, x, torch.zeros_like(x)), distance, size)
 
     assert torch.autograd.gradcheck(blend, inside)
-
-
-def test_without_fragments_transmittance_is_one():
-    weights, left = hybrid_weights(torch.zeros(3, 0), torch.zeros(3, 0), 16)
-    assert weights.shape == (3, 0) and torch.equal(left, torch.ones(3))
-    weights, left = hybrid_weights(torch.zeros(3, 2), torch.ones(3, 2), 16)
-    assert not weights.any() and torch.equal(left, torch.ones(3))

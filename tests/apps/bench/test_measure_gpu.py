@@ -69,18 +69,14 @@ def test_the_benchmark_comes_first_and_finished_steps_are_skipped(measure, tmp_p
     assert json.loads((tmp_path / "reports/measured/some-gpu.json").read_text())["steps"]["racecheck"] == "ok"
 
 
-def test_failed_steps_are_named_and_repeated(measure):
+def test_failed_steps_are_named_and_repeated_and_unknown_ones_refused(measure):
     line, _ = measure("build", "bench", "kernels", "tests", BROKEN="yes")
     assert "verified: build bench; not verified: kernels (failed (1)), tests (failed (1))" in line
     line, calls = measure("tests")
     assert calls == ["tests "] and line.startswith("verified: build bench tests;")
+    assert measure("racechek")[0].startswith("unknown step racechek; known: build bench kernels tests")
 
 
 def test_a_failed_configuration_ends_the_build(measure):
     line, calls = measure("build", BROKEN="-S")
     assert calls == ["cmake -S"] and "not verified: build (failed (1))" in line
-
-
-def test_unknown_steps_list_the_known_ones(measure):
-    line, _ = measure("racechek")
-    assert line.startswith("unknown step racechek; known: build bench kernels tests")
