@@ -8,6 +8,7 @@ import typer
 
 import padgs
 from padgs.cli.bench import bench
+from padgs.cli.blocks import merge, split
 from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.errors import without_traceback
@@ -37,5 +38,5 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, prepare, render, report, smallest, track, view):
+for command in (bench, check, convert, export, merge, prepare, render, report, smallest, split, track, view):
     app.command()(without_traceback(command))

@@ -119,7 +119,7 @@ def run(
                         store.save(method, progress)
                 outcome.result = replace(outcome.result, **_trained(method, scene, progress))
                 if scene.test:
-                    outcome.result = _scored(config, scene, store, outcome.result, method)
+                    outcome.result = scored(config, scene, store, outcome.result, method)
             result = store.finish(_final(config, outcome.result, progress))
     show_result(result, store.path, words)
     return result
@@ -202,7 +202,7 @@ def _prepared(config: RunConfig, scene: Scene, store: RunStore, console: Console
     return method, progress
 
 
-def _scored(config: RunConfig, scene: Scene, store: RunStore, result: Result, method: Method) -> Result:
+def scored(config: RunConfig, scene: Scene, store: RunStore, result: Result, method: Method) -> Result:
     """Return the result of a trained method with its frame times and scores."""
     save_image = store.save_image if config.run.pictures else None
     timing = result.timing | frame_times(method.render, scene)

@@ -207,12 +207,12 @@ def room_count(scene: Scene) -> float:
     if len(points) == 0:
         return 1.0  # the initialisation reports the empty cloud
     views = scene.train[:: -(-len(scene.train) // ROOM_VIEWS)]
-    visible = sum(visible_fraction(points, view) for view in views) / len(views)
+    visible = sum(visible_points(points, view).double().mean().item() for view in views) / len(views)
     return max(1.0, 1 / (SINGLE_ROOM * visible))
 
 
-def visible_fraction(points: Tensor, view: View) -> float:
-    """Return the share of points [N, 3] not far behind the surface, by bins of directions of equal solid angle."""
+def visible_points(points: Tensor, view: View, factor: float = OCCLUSION_FACTOR) -> Tensor:
+    """Return which points [N, 3] are nearer than `factor` times the surface, by bins of equal solid angle, [N] bool."""
     toward = points - view.center.to(points)
     distance = toward.norm(dim=-1)
     rows = max(6, round(math.sqrt(len(points) / POINTS_PER_BIN / 2)))  # by the cosine of the angle from world z
@@ -225,5 +225,5 @@ def visible_fraction(points: Tensor, view: View) -> float:
     count = torch.bincount(cell, minlength=2 * rows * rows)
     first = count.cumsum(0) - count
     surface = (first + (count - 1).clamp(0, SURFACE_RANK - 1)).clamp(max=len(points) - 1)
-    limit = OCCLUSION_FACTOR * distance[order[surface]]
-    return (distance <= limit[cell]).double().mean().item()
+    limit = factor * distance[order[surface]]
+    return distance <= limit[cell]

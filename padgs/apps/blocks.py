@@ -1,0 +1,350 @@
+"""A large capture as blocks: `split` writes a data set per block, `merge` joins the models trained on them.
+
+Cameras that see the same points form a block (recursive spectral bisection of their normalized graph), whatever lies
+between them on a plan. A point belongs to the block whose cameras see it best, and any other place to the block of the
+nearest point. A block trains on its own cameras and on the margin: other cameras that see into it, masked to what
+belongs to it. A merged model has of each run the Gaussians that lie in its block.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor
+
+import padgs.data
+from padgs.checks import typed
+from padgs.data.assemble import assemble, view_name
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions
+from padgs.data.formats.writers import Content, write_transforms
+from padgs.data.masks import write_masks
+from padgs.files import draft_of
+from padgs.geometry.camera import Panorama
+from padgs.geometry.distortion import solid_angle_weight
+from padgs.methods.splats.depth_initialization import visible_points
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.smoothing_filter import cameras_of
+from padgs.runs.console import show_result
+from padgs.runs.load import LoadedRun, load_run
+from padgs.runs.run import build_method, initial_result, load_scene, scored, start
+from padgs.runs.store import Progress, RunStore
+from padgs.runs.warm_start import WarmStart
+from padgs.scene import Scene, View
+from padgs.training.model import MODEL, State
+
+SAMPLE = 50_000  # points at most that visibility is estimated for; the others follow the nearest of them
+OCCLUSION = 1.05  # a point farther than so many times the surface is hidden
+SLACK = 0.25  # cuts may deviate from equal blocks by this share, to pass through a door
+ROWS = 48  # of the grid of directions that margin cameras are masked by
+NEIGHBOURS = 4  # points that decide to which block a direction belongs, by at least half
+MARGIN = 0.04  # share of the sphere of a margin camera that its block fills at least
+SEEN = 0.1  # share of the cameras of a block that see a point of another block which it begins with
+REGIONS, BLOCK = "regions.npz", "block.json"
+
+
+@dataclass(frozen=True)
+class Block:
+    """The description of a block in its folder."""
+
+    number: int  # from 0
+    count: int  # of all blocks
+    source: str  # the whole data set, relative to the folder of the block
+    format: str
+    options: dict[str, Any]  # of the loader of the source
+    regions: str  # SHA-256 of the file of regions in the parent folder
+
+
+def bisect(affinity: np.ndarray, members: np.ndarray, count: int) -> list[np.ndarray]:
+    """Divide nodes into `count` clusters of similar size by the normalized cut (Shi and Malik 2000) of [n, n]."""
+    if count == 1:
+        return [members]
+    part = affinity[np.ix_(members, members)]
+    degree = part.sum(1)
+    scaled = part / np.sqrt(degree[:, None] * degree)
+    order = np.argsort(np.linalg.eigh(scaled)[1][:, -2] / np.sqrt(degree), kind="stable")
+    part, degree = part[np.ix_(order, order)], degree[order]
+    best: tuple[float, int, int] | None = None
+    for first in {count // 2, count - count // 2}:
+        share = len(members) * first / count
+        low, high = math.ceil(share * (1 - SLACK)), math.floor(share * (1 + SLACK))
+        for cut in range(max(low, first), min(high, len(members) - count + first) + 1):
+            between = part[:cut, cut:].sum()
+            cost = between / degree[:cut].sum() + between / degree[cut:].sum()
+            best = min(best or (np.inf, 0, 0), (cost, cut, first))
+    assert best is not None, "there are at least as many members as clusters"
+    _, cut, first = best
+    rest = bisect(affinity, members[order[cut:]], count - first)
+    return [*bisect(affinity, members[order[:cut]], first), *rest]
+
+
+def visibility(capture: Capture, views: Sequence[View], cloud: Tensor) -> np.ndarray:
+    """Return which points each view sees, [views, points] bool: by tracks, else those on the nearest surfaces."""
+    seen = np.zeros((len(views), len(cloud)), bool)
+    if capture.tracks is not None and len((tracks := capture.tracks()).frame):
+        rows = {view.name: row for row, view in enumerate(views)}
+        row = np.array([rows.get(view_name(frame.name), -1) for frame in capture.frames])[tracks.frame.numpy()]
+        seen[row[row >= 0], tracks.point.numpy()[row >= 0]] = True
+    else:
+        for row, view in enumerate(views):
+            seen[row] = visible_points(cloud, view, OCCLUSION).numpy()
+    return seen
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Division of a capture into blocks."""
+
+    points: Tensor  # [S, 3] float64, of the cloud
+    owner: np.ndarray  # [S] block of each point
+    core: list[list[View]]  # training views of each block
+    margin: list[list[tuple[View, np.ndarray]]]  # other views, and the directions that belong to it
+    test: list[list[View]]
+    used: np.ndarray  # [blocks, S] points that a block begins with
+
+
+def plan(capture: Capture, scene: Scene, count: int) -> Plan:
+    """Divide the views of a scene, in the world of its poses as the capture states them."""
+    from scipy.spatial import KDTree
+
+    if capture.cloud is None or not len(capture.cloud.points):
+        raise DataError(f"{capture.folder} has no point cloud, and blocks are made of cameras that share points")
+    poses = {view_name(frame.name): frame.cam_from_world for frame in capture.frames}
+    train, test = ([replace(v, cam_from_world=poses[v.name]) for v in side] for side in (scene.train, scene.test))
+    if not 2 <= count <= len(train) // 2:
+        raise DataError(f"--blocks is {count}; {len(train)} training views make 2 to {len(train) // 2} blocks")
+    tracked = capture.tracks is not None and len(capture.tracks().frame) > 0
+    step = 1 if tracked else max(1, math.ceil(len(capture.cloud.points) / SAMPLE))
+    points = capture.cloud.points[::step].double()
+    seen = visibility(capture, [*train, *test], points)
+    shared = seen[: len(train)].astype(np.float32)
+    affinity = shared @ shared.T
+    sizes = np.maximum(np.diag(affinity), 1)
+    affinity = affinity / np.sqrt(sizes[:, None] * sizes) + 1e-6  # cameras that see nothing join any block
+    clusters = sorted((np.sort(part) for part in bisect(affinity, np.arange(len(train)), count)), key=lambda c: c[0])
+    distance = torch.cdist(torch.stack([v.center for v in train]), points).numpy()
+    weight = seen[: len(train)] / np.maximum(distance, 1e-9) ** 2 + 1e-9 / np.maximum(distance, 1e-9) ** 2
+    owner = np.stack([weight[part].sum(0) for part in clusters]).argmax(0)
+    rays = Panorama(2 * ROWS, ROWS).rays(dtype=torch.float64).reshape(-1, 3)
+    area = solid_angle_weight(ROWS, dtype=torch.float64).numpy()[:, None] / 2 / ROWS
+    area = area / solid_angle_weight(ROWS, dtype=torch.float64).sum().item()
+    directions = np.zeros((len(seen), count, ROWS, 2 * ROWS), bool)  # of each view that belong to each block
+    for row, view in enumerate([*train, *test]):
+        if len(index := seen[row].nonzero()[0]):
+            toward = (points[index] - view.center) @ view.cam_from_world[:3, :3].T
+            tree = KDTree(torch.nn.functional.normalize(toward, dim=1).numpy())
+            near = tree.query(rays.numpy(), k=[*range(1, 1 + min(NEIGHBOURS, len(index)))])[1]
+            for block in range(count):
+                held = (owner[index][near] == block).mean(1) >= 0.5
+                directions[row, block] = held.reshape(ROWS, 2 * ROWS)
+    share = (directions * area).sum((2, 3))  # [views, blocks]
+    margin, tests, used = [], [], np.zeros((count, len(points)), bool)
+    best = share[len(train) :].argmax(1) if test else np.zeros(0, int)
+    for block, cluster in enumerate(clusters):
+        others = [n for n in range(len(train)) if n not in set(cluster) and share[n, block] >= MARGIN]
+        margin.append([(train[n], directions[n, block]) for n in others])
+        own = [n for n in range(len(test)) if best[n] == block] or [int(share[len(train) :, block].argmax())] * bool(
+            test
+        )
+        tests.append([test[n] for n in own])
+        used[block] = (seen[cluster].mean(0) >= SEEN) | (owner == block)
+    return Plan(points, owner, [[train[n] for n in cluster] for cluster in clusters], margin, tests, used)
+
+
+def split(source: Path, destination: Path, count: int, format: str, options: DataOptions) -> list[str]:
+    """Write a data set for each block into a new folder; images are links. Return a line about each block.
+
+    Raises:
+        DataError: the source cannot be used or divided, or the destination is not empty; nothing is written then.
+    """
+    from scipy.spatial import KDTree
+
+    if destination.exists():
+        raise DataError(f"{destination} exists; nothing is overwritten: remove it, or name another folder with --to")
+    capture = padgs.data.read(source, format, options)
+    scene = assemble(capture, options)
+    blocks = plan(capture, scene, count)
+    assert capture.cloud is not None, "refused by plan"
+    points, colors = capture.cloud.points, capture.cloud.colors
+    nearest = KDTree(blocks.points.numpy()).query(points.numpy())[1]
+    frames = {view_name(frame.name): frame for frame in capture.frames}
+    masks = {view.name: view.load_mask for view in (*scene.train, *scene.test)}
+    given = {key: value for key, value in asdict(options).items() if key in ("images", "mask", "split", "dataset")}
+    lines = []
+    destination.parent.mkdir(parents=True, exist_ok=True)
+    with draft_of(destination) as partial:
+        partial.mkdir()
+        np.savez(partial / REGIONS, points=blocks.points.numpy(), owner=blocks.owner.astype(np.int16))
+        digest = hashlib.sha256((partial / REGIONS).read_bytes()).hexdigest()
+        for number, core in enumerate(blocks.core):
+            name = f"{scene.name}-block-{number + 1}"
+            folder, final = partial / name, destination / name
+            folder.mkdir()
+            margin = [view for view, _ in blocks.margin[number]]
+            sides = {"train": [*core, *margin], "test": blocks.test[number]}
+            views = [*sides["train"], *sides["test"]]
+            for view in views:
+                link, image = Path("images", frames[view.name].name), frames[view.name].image.resolve()
+                (folder / link).parent.mkdir(parents=True, exist_ok=True)
+                (folder / link).symlink_to(os.path.relpath(image, (final / link).parent.absolute()))
+            kept = torch.from_numpy(blocks.used[number][nearest])
+            content = Content(
+                frames=tuple(replace(frames[v.name], width=v.width, height=v.height) for v in views),
+                cloud=Cloud(points[kept], None if colors is None else colors[kept]),
+                tracks=None,
+                split={side: tuple(frames[v.name].name for v in part) for side, part in sides.items() if scene.test},
+            )
+            write_transforms(content, folder)
+            within = {view.name: partial_mask(view, held) for view, held in blocks.margin[number]}
+            write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
+            block = Block(number, count, os.path.relpath(source.absolute(), final.absolute()), format, given, digest)
+            (folder / BLOCK).write_text(json.dumps(asdict(block), indent=1))
+            parts = f"{len(core)} training views, {len(margin)} in the margin, {len(blocks.test[number])} test views"
+            lines.append(f"{final}: {parts}, {int(kept.sum())} points")
+        os.replace(partial, destination)
+    return lines
+
+
+def partial_mask(view: View, held: np.ndarray) -> Callable[[], Tensor]:
+    """Return a function that loads the mask of a view, restricted to directions [ROWS, 2 ROWS]."""
+
+    def load() -> Tensor:
+        rows, columns = (
+            torch.arange(size) * count // size
+            for size, count in zip((view.height, view.width), held.shape, strict=True)
+        )
+        inside = torch.from_numpy(held)[rows][:, columns].float()
+        mask = view.mask()
+        return inside if mask is None else inside * mask
+
+    return load
+
+
+def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> Path:
+    """Join the runs of all blocks into a run on the whole data set, and score that on all test views.
+
+    Raises:
+        ValueError: a run is of no block, missing, twice, not finished, or of another method or other settings.
+    """
+    runs = [load_run(folder, device=device) for folder in folders]
+    blocks = [_block_of(run) for run in runs]
+    first, block = runs[0], blocks[0]
+    for run, other in zip(runs, blocks, strict=True):
+        _refuse_other(run, first)
+        if (other.regions, other.count) != (block.regions, block.count):
+            raise ValueError(f"{run.folder} is of another division than {first.folder}; merge runs of one padgs split")
+    numbers = [other.number for other in blocks]
+    for number in range(block.count):
+        if numbers.count(number) != 1:
+            trouble = "no run" if number not in numbers else "several runs"
+            raise ValueError(f"block {number + 1} of {block.count} has {trouble}; give one run of each block")
+    folder = Path(str(first.config.data.path))
+    data = replace(
+        first.config.data, path=os.path.normpath(folder / block.source), format=block.format, **block.options
+    )
+    together = hashlib.sha256("".join(sorted(run.digest for run in runs)).encode()).hexdigest()
+    config = replace(
+        first.config,
+        data=data,
+        variant=", ".join(filter(None, (first.config.variant, f"{block.count} blocks"))),
+        init=WarmStart(" ".join(folders), together),
+    )
+    scene = load_scene(config, start(config))
+    store = RunStore.of(config, scene)
+    with np.load(folder.parent / REGIONS, allow_pickle=False) as regions:
+        state = _joined(runs, numbers, regions["points"], regions["owner"], scene)
+    with store:
+        method = build_method(config)
+        method.load_state(state)
+        store.prepare(config.values())
+        ends = [run.result for run in runs if run.result is not None]
+        times = {name: math.fsum(end.timing[name] for end in ends) for name in ("train_seconds", "cpu_seconds")}
+        iterations = sum(end.iterations_done for end in ends)
+        store.save(method, Progress(iterations, times["train_seconds"], times["cpu_seconds"], 1.0))
+        size = method.size()
+        result = replace(
+            initial_result(config, scene, store.path.name),
+            iterations=iterations,
+            iterations_done=iterations,
+            counts={**size.counts, "parameters": size.parameters},
+            model_bytes=size.bytes,
+            timing=times,
+            peak_memory_bytes=max(end.peak_memory_bytes for end in ends),
+            finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        )
+        result = store.finish(scored(config, scene, store, result, method) if scene.test else result)
+    show_result(result, store.path, console)
+    return store.path
+
+
+def _block_of(run: LoadedRun) -> Block:
+    folder = Path(run.config.data.path or "")
+    if run.config.data.path is None or not (folder / BLOCK).is_file():
+        raise ValueError(
+            f"{run.folder} is no run of a block ({folder / BLOCK} is missing); train what padgs split wrote"
+        )
+    block = typed(Block, json.loads((folder / BLOCK).read_text()), str(folder / BLOCK))
+    if hashlib.sha256((folder.parent / REGIONS).read_bytes()).hexdigest() != block.regions:
+        raise ValueError(f"{folder.parent / REGIONS} is not that of {folder}; split the data set again")
+    run.refuse_other_data()
+    return block
+
+
+def _refuse_other(run: LoadedRun, first: LoadedRun) -> None:
+    """Refuse a run that did not end well, or that cannot be joined with the first one."""
+    train, model = run.config.train, run.method.model
+    if run.result is None or not run.result.ok:
+        raise ValueError(f"{run.folder} did not end well; start it again, or give another run of its block")
+    if not isinstance(model, SplatModel):
+        raise ValueError(
+            f"{run.folder} is of {run.config.method}, whose parts share parameters; merge explicit Gaussians"
+        )
+    if {train.exposures, train.poses, train.lens} != {"given"}:
+        raise ValueError(
+            f"{run.folder} learned poses, exposures or a lens, which differ between blocks; leave them given"
+        )
+    if run.config.stress.title:
+        raise ValueError(f"{run.folder} was trained under stress {run.config.stress.title}; merge runs without")
+    if (run.config.method, run.config.options, run.config.render) != (
+        first.config.method,
+        first.config.options,
+        first.config.render,
+    ):
+        raise ValueError(f"{run.folder} has other settings of method or render than {first.folder}; train them alike")
+
+
+def _joined(
+    runs: Sequence[LoadedRun], numbers: Sequence[int], points: np.ndarray, owner: np.ndarray, scene: Scene
+) -> State:
+    """Return the state of a model of all Gaussians that lie in the blocks of their runs, in the world of the scene."""
+    from scipy.spatial import KDTree
+
+    tree, parts = KDTree(points), []
+    for run, number in zip(runs, numbers, strict=True):
+        state = run.method.state().of_model()
+        means = state.tensors["splats/means"].double().cpu() + run.scene.origin.cpu()
+        kept = torch.from_numpy(owner[tree.query(means.numpy())[1]] == number)
+        rows = {n: t[kept] for n, t in state.tensors.items() if n.startswith(("splats/", "statistics/", "filter/"))}
+        rows["splats/means"] = (means[kept] - scene.origin.cpu()).float()
+        parts.append(rows)
+    stored = runs[0].method.state()
+    model = stored.of_model()
+    tensors = {**model.tensors, **{name: torch.cat([part[name] for part in parts]) for name in parts[0]}}
+    if "cameras" in tensors:
+        tensors["cameras"] = cameras_of(scene.train)
+    values = model.values | {"scene_scale": scene.scale, "extent": scene.extent}
+    values["active_degree"] = max(run.method.model.splats.active_degree for run in runs)
+    others = {name: tensor for name, tensor in stored.tensors.items() if name.startswith("random/")}
+    return State(
+        {f"{MODEL}{name}": tensor for name, tensor in tensors.items()} | others, stored.values | {"model": values}
+    )

@@ -1,0 +1,46 @@
+"""`padgs split` and `padgs merge`: a large capture as blocks that are trained one by one."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from padgs.cli.errors import check_range, name_place, show
+
+
+def split(
+    source: Annotated[str, typer.Argument(help="folder with panoramas, poses and points")],
+    blocks: Annotated[int, typer.Option(help="number of blocks")],
+    to: Annotated[str, typer.Option(help="folder to write; default: SOURCE-blocks")] = "",
+    format: Annotated[str, typer.Option(help="format of the source, as data.format")] = "auto",
+    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
+    split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+) -> None:
+    """Divide a data set into blocks of cameras that see the same points; their images are links to those of SOURCE."""
+    import shlex
+    from pathlib import Path
+
+    from padgs.apps.blocks import split as write
+    from padgs.data.capture import DataOptions
+
+    check_range(2, 10_000, blocks=blocks)
+    destination = Path(to or f"{source.rstrip('/')}-blocks")
+    with name_place(destination):
+        lines = write(Path(source), destination, blocks, format, DataOptions(mask=mask, split=split))
+    for line in lines:
+        show(line)
+    names = ",".join(line.partition(": ")[0] for line in lines)
+    show(f"next: {shlex.join(['padgs-run', '-m', f'data.path={names}'])}, then padgs merge with the runs")
+
+
+def merge(
+    runs: Annotated[list[str], typer.Argument(help="folders of the finished runs, one of each block")],
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+) -> None:
+    """Join the runs of all blocks into one run on the whole data set, scored on all its test views."""
+    from rich.console import Console
+
+    from padgs.apps.blocks import merge as join
+
+    join(runs, Console(highlight=False, soft_wrap=True), device=device)
