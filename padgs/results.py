@@ -116,7 +116,7 @@ def higher_is_better(metric: str) -> bool | None:
 
 # Configuration keys that results do not depend on except by rounding: those of the machine, and others. The fingerprint
 # stands for the data, scoring comes after training, and the monitor may end a run but changes no number.
-OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.prefetch_threads")
+OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.disk_cache", "data.prefetch_threads")
 DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.monitor")
 
 

@@ -237,7 +237,8 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
         ValueError: a run is of no block, missing, twice, not finished, or of another method or other settings.
     """
     runs = [load_run(folder, device=device) for folder in folders]
-    blocks = [_block_of(run) for run in runs]
+    pairs = sorted(((_block_of(run), run) for run in runs), key=lambda pair: pair[0].number)
+    blocks, runs = map(list, zip(*pairs, strict=True))
     first, block = runs[0], blocks[0]
     for run, other in zip(runs, blocks, strict=True):
         _refuse_other(run, first)
@@ -257,7 +258,7 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
         first.config,
         data=data,
         variant=", ".join(filter(None, (first.config.variant, f"{block.count} blocks"))),
-        init=WarmStart(" ".join(folders), together),
+        init=WarmStart(" ".join(map(str, (run.folder for run in runs))), together),
     )
     scene = load_scene(config, start(config))
     store = RunStore.of(config, scene)

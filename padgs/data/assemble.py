@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +15,7 @@ from padgs.data.cloud import initial_cloud
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
 from padgs.data.masks import find_masks, masks_beside
 from padgs.data.splits import is_inside, spellings, split_frames
-from padgs.data.store import ImageStore, StoredImage
+from padgs.data.store import ImageStore, StoredImage, cache_root
 from padgs.scene import Scene, View
 
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
@@ -53,7 +54,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split, unposed=unposed
     )
     points, colors, cloud_notes = initial_cloud(capture, options.points)
-    store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device)
+    folder, cache_notes = disk_cache(options, 3 * sum(width * height for width, height in sizes))
+    store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device, folder)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = [
         View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
@@ -66,7 +68,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         points=points,
         point_colors=colors,
         fingerprint="",
-        notes=(*notes, *split.notes, *mask_notes, *cloud_notes),
+        notes=(*notes, *split.notes, *mask_notes, *cloud_notes, *cache_notes),
     ).recentered()
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):
@@ -76,6 +78,27 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     digest.update(scene.points.numpy().tobytes())
     digest.update(colors.numpy().tobytes())
     return replace(scene, fingerprint=digest.hexdigest())
+
+
+def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]:
+    """Return the folder that keeps decoded images of so many bytes in all if they exceed the memory for them; a note.
+
+    There is none if it would take more than half of the free space.
+    """
+    if size <= options.cache_bytes or options.disk_cache == "off":
+        return None, []
+    folder = Path(options.disk_cache) if options.disk_cache != "auto" else cache_root() / "images"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise DataError(
+            f"data.disk_cache: cannot write {folder}: {error.strerror}; name another folder, or off"
+        ) from error
+    gigabytes = f"{size / 1e9:.1f} GB of decoded images exceed data.cache_bytes"
+    if 2 * size > free:
+        return None, [f"images: {gigabytes} and half of the free space of {folder}; each is decoded when it is needed"]
+    return folder, [f"images: {gigabytes}, they are kept in {folder} (data.disk_cache; it may be deleted)"]
 
 
 def view_name(frame_name: str) -> str:

@@ -139,6 +139,7 @@ class DataSettings:
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
     test_every: int = 8  # k of split=every
     cache_bytes: int = 1 << 30  # memory for decoded images of all views
+    disk_cache: str = "auto"  # auto: keep decoded images on disk if they exceed cache_bytes | off | a folder
     prefetch_threads: int = 2  # threads that decode images in advance; 0 = none
     generator: Mapping[str, Any] = field(default_factory=dict)  # options of the synthetic scene
 

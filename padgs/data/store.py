@@ -1,12 +1,16 @@
-"""Decoded images of all views: area filter, and one bounded cache that a few threads fill in advance.
+"""Decoded images of all views: area filter, one bounded cache that a few threads fill in advance, and one on disk.
 
-Caching and prefetching do not change pixel values.
+Caching and prefetching do not change pixel values. The cache on disk holds each image at each size that was asked for,
+as raw bytes: decoding and reducing a panorama takes far longer than reading it.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -18,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.images import decode
+from padgs.files import atomic_path
 
 
 def area_resize(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
@@ -67,6 +72,12 @@ def _weighted_sum(image: NDArray, index: NDArray[np.intp], weight: NDArray[np.fl
     return total
 
 
+def cache_root() -> Path:
+    """Return the folder of all caches: $PADGS_CACHE, or ~/.cache/padgs."""
+    named = os.environ.get("PADGS_CACHE")
+    return Path(named) if named else Path.home() / ".cache" / "padgs"
+
+
 class Decodable(Protocol):
     """A cache key of `ImageStore` that can compute its pixels."""
 
@@ -74,13 +85,22 @@ class Decodable(Protocol):
         """Return the pixels without the cache."""
         ...
 
+    def file(self, folder: Path) -> tuple[Path, tuple[int, int, int]]:
+        """Return the file of the pixels in a cache on disk, and their shape."""
+        ...
+
 
 class ImageStore:
     """Least-recently-used cache of decoded images, bounded in bytes. Thread-safe."""
 
-    def __init__(self, limit_bytes: int = 1 << 30, threads: int = 2, device: str = "cpu") -> None:
-        """Keep at most `limit_bytes` of pixels on `device`; `threads` = 0 disables prefetching."""
-        self.limit_bytes, self.threads, self.device = limit_bytes, threads, device
+    def __init__(
+        self, limit_bytes: int = 1 << 30, threads: int = 2, device: str = "cpu", folder: Path | None = None
+    ) -> None:
+        """Keep at most `limit_bytes` of pixels on `device`, and all in `folder` if it is given.
+
+        `threads` = 0 disables prefetching.
+        """
+        self.limit_bytes, self.threads, self.device, self.folder = limit_bytes, threads, device, folder
         self.bytes = 0
         self.decoded = 0  # number of decoded images
         self._kept: OrderedDict[Decodable, Tensor] = OrderedDict()
@@ -120,7 +140,7 @@ class ImageStore:
     def _fill(self, image: Decodable, future: Future[Tensor]) -> None:
         """Decode into the cache; an error is raised where the future's result is used."""
         try:
-            pixels = image.decode().to(self.device)
+            pixels = (image.decode() if self.folder is None else self._stored(image, self.folder)).to(self.device)
         except BaseException as error:
             with self._lock:
                 del self._pending[image]
@@ -135,6 +155,16 @@ class ImageStore:
                 self._kept[image] = pixels
                 self.bytes += pixels.nbytes
         future.set_result(pixels)
+
+    def _stored(self, image: Decodable, folder: Path) -> Tensor:
+        """Read the pixels of an image from disk, or decode and write them; a full disk loses only the file."""
+        with suppress(OSError, ValueError):
+            path, shape = image.file(folder)
+            return torch.from_numpy(np.fromfile(path, np.uint8).reshape(shape))
+        pixels = image.decode()
+        with suppress(OSError), atomic_path(image.file(folder)[0]) as draft:
+            pixels.numpy().tofile(draft)
+        return pixels
 
 
 @dataclass(frozen=True)
@@ -158,3 +188,10 @@ class StoredImage:
     def decode(self) -> Tensor:
         """Read, decode and reduce without the cache."""
         return torch.from_numpy(area_resize(decode(self.path, self.mode), self.width, self.height))
+
+    def file(self, folder: Path) -> tuple[Path, tuple[int, int, int]]:
+        """Return the file of the pixels in a cache on disk, named by the image file, its time and the size."""
+        status = os.stat(self.path)
+        text = f"{self.path.resolve()}|{status.st_size}|{status.st_mtime_ns}|{self.mode}|{self.width}x{self.height}"
+        name = f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.raw"
+        return folder / name, (self.height, self.width, 3 if self.mode == "RGB" else 1)

@@ -1,5 +1,6 @@
 """Area filter and cache of decoded images."""
 
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,7 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
+from padgs.data import store as store_module
 from padgs.data.capture import DataError
+from padgs.data.images import decode
 from padgs.data.store import ImageStore, StoredImage, area_resize
 
 BYTES = 32 * 16 * 3
@@ -43,6 +46,22 @@ def test_a_limit_of_zero_disables_the_cache(files: list[Path]) -> None:
     image = StoredImage(files[0], 32, 16, store)
     assert torch.equal(image(), image())
     assert store.decoded == 2 and store.bytes == 0
+
+
+def test_images_are_decoded_once_where_the_disk_keeps_them(files: list[Path], tmp_path: Path, monkeypatch) -> None:
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    first, later = (ImageStore(limit_bytes=0, folder=folder) for _ in range(2))
+    for path in files:
+        assert torch.equal(StoredImage(path, 32, 16, first)(), _expected(path))
+    assert sorted(file.stat().st_size for file in folder.iterdir()) == [BYTES] * 6
+    os.utime(files[0], (1, 1))  # it was written anew
+    StoredImage(files[1], 32, 16, first).file(folder)[0].write_bytes(b"cut")
+    decoded = []
+    monkeypatch.setattr(store_module, "decode", lambda path, mode: decoded.append(path) or decode(path, mode))
+    for path in files:
+        assert torch.equal(StoredImage(path, 32, 16, later)(), _expected(path))
+    assert decoded == files[:2]
 
 
 @pytest.mark.parametrize("threads", [0, 1, 3])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache, partial
@@ -21,7 +20,7 @@ from PIL import Image
 
 from padgs.checks import ConfigError, typed
 from padgs.data.capture import DataError, DataOptions
-from padgs.data.store import ImageStore, StoredImage
+from padgs.data.store import ImageStore, StoredImage, cache_root
 from padgs.data.synthetic import camera, paths
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
 from padgs.data.synthetic.textures import Array
@@ -134,10 +133,9 @@ def cache_folder(options: SyntheticOptions) -> Path:
     It is in $PADGS_CACHE, or ~/.cache/padgs, and holds PNGs, `scene.npz` and the digest of both. A scene that does not
     fit its digest is generated again. Without write access there is no cache.
     """
-    named = os.environ.get("PADGS_CACHE")
     digest = hashlib.sha256(json.dumps(asdict(options), sort_keys=True).encode())
     digest.update(_source())
-    return (Path(named) if named else Path.home() / ".cache" / "padgs") / "synthetic" / digest.hexdigest()[:24]
+    return cache_root() / "synthetic" / digest.hexdigest()[:24]
 
 
 @cache

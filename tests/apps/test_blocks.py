@@ -1,0 +1,152 @@
+"""A capture of two rooms as two blocks, trained one by one and merged."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from typer.testing import CliRunner
+
+import padgs.data
+from padgs import results
+from padgs.apps import blocks
+from padgs.apps.blocks import bisect, merge
+from padgs.cli.commands import app
+from padgs.data.assemble import assemble
+from padgs.data.capture import Capture, Cloud, DataOptions, Frame, Tracks
+from padgs.data.formats.writers import Content, write_transforms
+from padgs.data.images import save_png
+from padgs.multirun.composition import composing, configuration
+from padgs.runs.run import run
+from padgs.scene import View
+
+TRAINING = ["train.iterations=20", "protocol=sphere", "protocol.sphere.lpips=none", "run.device=cpu", "tracking=none"]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    """Two rooms with a door between them, as a folder."""
+    folder, frames = tmp_path_factory.mktemp("data") / "rooms", []
+    generator = {"scene": "room_chain", "width": 32, "train_views": 16, "test_views": 4, "samples": 1, "points": 4000}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PADGS_CACHE", str(tmp_path_factory.getbasetemp() / "scenes"))
+        scene = padgs.data.load(generator=generator)
+    for side in ("train", "test"):
+        for view in getattr(scene, side):
+            frames.append(Frame(f"{side}{view.name}.png", folder, view.cam_from_world, 32, 16))
+            save_png(view.load_pixels(), folder / "images" / frames[-1].name)
+    names = {side: tuple(f.name for f in frames if f.name.startswith(side)) for side in ("train", "test")}
+    write_transforms(Content(tuple(frames), Cloud(scene.points.double(), scene.point_colors), None, names), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def parts(source) -> list[Path]:
+    """The folders of two blocks."""
+    done = CliRunner().invoke(app, ["split", str(source), "--blocks", "2"])
+    assert done.exit_code == 0 and "next: padgs-run -m data.path=" in done.output, done.output
+    return sorted(source.with_name("rooms-blocks").glob("rooms-block-*"))
+
+
+def trained(folder: Path, runs: Path, *settings: str) -> str:
+    with composing():
+        config = configuration([f"data.path={folder}", "method=omnigs", *TRAINING, *settings, f"run.folder={runs}"])
+    return str(runs / run(config, Console(quiet=True)).run)
+
+
+@pytest.fixture(scope="module")
+def runs(parts, tmp_path_factory) -> list[str]:
+    folder = tmp_path_factory.mktemp("runs")
+    return [trained(part, folder) for part in parts]
+
+
+@pytest.mark.parametrize("sizes", [(5, 5), (4, 6, 5), (9, 9, 9, 9, 9)])
+def test_groups_that_share_little_are_clusters(sizes):
+    label = np.repeat(np.arange(len(sizes)), sizes)
+    neighbours = np.abs(label[:, None] - label) == 1
+    affinity = np.where(label[:, None] == label, 1.0, np.where(neighbours, 0.05, 1e-6))
+    shuffled = np.random.default_rng(0).permutation(len(label))
+    found = bisect(affinity[np.ix_(shuffled, shuffled)], np.arange(len(label)), len(sizes))
+    assert sorted(sorted(label[shuffled[part]].tolist()) for part in found) == [
+        [k] * size for k, size in enumerate(sizes)
+    ]
+
+
+def test_tracks_say_what_a_camera_sees():
+    frames = tuple(Frame(f"{name}.png", Path(), torch.eye(4)) for name in "ab")
+    tracks = Tracks(torch.tensor([0, 1, 1]), torch.tensor([2, 0, 1]), torch.zeros(3, 2))
+    capture = Capture("colmap", Path(), Path(), frames, None, tracks=lambda: tracks)
+    views = [View(name, torch.eye(4), 8, 4) for name in "ba"]
+    assert blocks.visibility(capture, views, torch.zeros(3, 3)).tolist() == [[True, True, False], [False, False, True]]
+
+
+def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
+    whole, loaded = padgs.data.load(source), [padgs.data.load(part) for part in parts]
+    capture = padgs.data.read(source)
+    plan = blocks.plan(capture, assemble(capture, DataOptions()), 2)
+    for core, margin, scene, part in zip(plan.core, plan.margin, loaded, parts, strict=True):
+        sides = {float(view.center[0]) > 0 for view in core}
+        assert len(core) == 8 and len(sides) == 1
+        near = [abs(float(view.center[0])) for view, _ in margin]
+        assert 2 <= len(margin) <= 6 and max(near) < 2.5, "those near the door"
+        by_name = {view.name: view for view in scene.train}
+        for view, held in margin:
+            mask = by_name[view.name].mask()
+            assert mask is not None and 0.04 < held.mean() < 0.6 and 0.04 < mask.mean() < 0.6
+        assert all(by_name[view.name].mask() is None for view in core)
+        assert len(scene.points) < 0.9 * len(whole.points)
+        assert all(path.is_symlink() for path in (part / "images").iterdir())
+    tests = [view.name for scene in loaded for view in scene.test]
+    assert sorted(tests) == sorted(view.name for view in whole.test)
+
+
+def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, capsys):
+    path = merge(runs, Console(width=200))
+    assert str(path) in capsys.readouterr().out
+    merged, loaded = padgs.load_run(path, device="cpu"), [padgs.load_run(one, device="cpu") for one in runs]
+    assert merged.result.ok and merged.result.variant == "2 blocks, continued"
+    assert merged.config.data.path == str(source)
+    assert len(merged.scene.test) == 4 and merged.score("sphere").metrics == merged.scores["sphere"].metrics
+    assert merged.result.timing["cpu_seconds"] == sum(one.result.timing["cpu_seconds"] for one in loaded)
+    means = merged.method.model.splats.means
+    count = 0
+    for one in loaded:
+        own = one.method.model.splats.means
+        kept = (own[:, None] == means).all(-1).any(-1)
+        side = float(np.median([float(view.center[0]) for view in one.scene.train])) > 0
+        x = own[:, 0]
+        assert kept[(x > 0.3) == side][x[(x > 0.3) == side].abs() > 0.3].float().mean() > 0.95
+        count += int(kept.sum())
+    assert count == len(means)
+    assert merge(runs[::-1], Console(quiet=True)) == path, "in any order"
+
+
+def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
+    def error(*folders: str) -> str:
+        done = CliRunner().invoke(app, ["merge", *folders])
+        assert done.exit_code == 1 and done.output.startswith("error: "), done.output
+        return done.output
+
+    assert "block 2 of 2 has no run; give one run of each block" in error(runs[0])
+    assert "block 1 of 2 has several runs" in error(*runs, runs[0])
+    assert "whose parts share parameters" in error(trained(parts[0], tmp_path, "method=padgs"), runs[1])
+    assert "has other settings of method" in error(runs[0], trained(parts[1], tmp_path, "method.sh_degree=1"))
+    assert "is no run of a block" in error(trained(source, tmp_path), runs[1])
+    copy = shutil.copytree(runs[0], tmp_path / "copy")
+    results.write(replace(results.read(copy / "result.json"), status="nan", reason="x"), copy)
+    assert "did not end well" in error(str(copy), runs[1])
+
+
+def test_what_cannot_be_split_is_refused_and_nothing_is_written(source, parts, tmp_path):
+    for arguments, message in (
+        (["--blocks", "9"], "--blocks is 9; 16 training views make 2 to 8 blocks"),
+        (["--blocks", "1"], "--blocks is 1; it must be from 2"),
+        (["--blocks", "2", "--to", str(parts[0])], "exists; nothing is overwritten"),
+        (["--blocks", "2", "--to", "/proc/x"], "cannot write /proc/x"),
+    ):
+        done = CliRunner().invoke(app, ["split", str(source), "--to", str(tmp_path / "to"), *arguments])
+        assert done.exit_code == 1 and message in done.output, done.output
+    assert list(tmp_path.iterdir()) == []
