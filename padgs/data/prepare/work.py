@@ -111,8 +111,9 @@ def find_result(source: Path, destination: Path, options: PrepareOptions) -> Pre
         record = json.loads((destination / PREPARED).read_text(encoding="utf-8"))
         if record["input"] != digest_of(fingerprint(source, options), options):
             return None
-        lists = {name: tuple(record[name]) for name in ("registered", "unregistered", "notes")}
-        return Prepared(destination, points=record["points"], observations=record["observations"], **lists)
+        names = ("registered", "unregistered", "points", "observations")
+        registered, unregistered, *counts = (record[name] for name in names)
+        return Prepared(destination, tuple(registered), tuple(unregistered), *counts, notes=tuple(record["notes"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

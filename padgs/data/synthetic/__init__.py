@@ -100,11 +100,11 @@ def _make(options: SyntheticOptions) -> Stored:
     held_out = set(paths.held_out(options))
     images = []
     for index, pose in enumerate(truth.poses):
+        world = truth.world_seen(index)
         if index in held_out or not (options.lens_gap or options.lens_k1):
-            images.append(camera.draw(truth.world, pose, options.width, options.samples, options.seed))
+            images.append(camera.draw(world, pose, options.width, options.samples, options.seed))
         else:
-            gap = options.lens_gap * truth.median_depth
-            images.append(camera.draw_stitched(truth.world, pose, gap, options))
+            images.append(camera.draw_stitched(world, pose, options.lens_gap * truth.median_depth, options))
     train = [index for index in range(len(images)) if index not in held_out]
     points, colors = camera.sample_points(
         truth.world, truth.poses[train], [images[index] for index in train], options, truth.random("points")

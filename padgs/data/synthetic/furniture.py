@@ -100,6 +100,25 @@ def plant(x: float, y: float, height: float, rng: np.random.Generator) -> list[S
     return shapes
 
 
+def person(x: float, y: float, heading: float) -> list[Shape]:
+    """Return a person of 1.75 m in mid-stride."""
+    ahead = np.array((math.cos(heading), math.sin(heading), 0.0))
+    left, foot = np.array((-ahead[1], ahead[0], 0.0)), np.array((x, y, 0.0))
+    cloth, shirt = (matt(tx.stripes(colors, 0.03)) for colors in (((0.1, 0.14, 0.3), (0.16, 0.2, 0.4)), BRIGHT[:2]))
+    skin = matt(tx.plain((0.8, 0.58, 0.45), 0.2, 0.3))
+
+    def limb(start: Array, end: Array, radius: float, material: tuple[Material, ...]) -> Rod:
+        return Rod(point(foot + start), point(foot + end), radius, material, rounded=True)
+
+    up = np.array((0.0, 0.0, 1.0))
+    shapes: list[Shape] = [limb(0.95 * up, 1.35 * up, 0.17, shirt), Sphere(point(foot + 1.63 * up), 0.12, skin)]
+    for side in (1, -1):
+        shapes.append(limb(0.1 * side * left + 0.9 * up, side * (0.1 * left + 0.28 * ahead) + 0.06 * up, 0.07, cloth))
+        hand = side * (0.26 * left - 0.25 * ahead) + 0.9 * up
+        shapes.append(limb(0.22 * side * left + 1.4 * up, hand, 0.045, skin))
+    return shapes
+
+
 def crates(x: float, y: float, rng: np.random.Generator) -> list[Shape]:
     """Return a stack of printed wooden crates."""
     shapes: list[Shape] = []

@@ -47,7 +47,7 @@ class SyntheticOptions:
     """Options of a synthetic scene. The defaults are the scene of a run without arguments.
 
     Worlds are built and rendered in metres; `world_scale` is then applied to poses, points and depth, so that images do
-    not depend on it. Pose noise and the two lenses affect training views only.
+    not depend on it. Pose noise, the two lenses and the figure affect training views only.
     """
 
     scene: str = "room"  # a name of `padgs.data.synthetic.SCENES`
@@ -75,6 +75,7 @@ class SyntheticOptions:
     lens_k1: float = 0.0  # of both lenses: theta' = theta (1 + k1 theta^2), see padgs/geometry/lens.py
     lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are blended
     world_scale: float = 1.0  # world units per metre
+    figure: bool = False  # a person walks through the scene: at another place in each training view, in no test view
 
     def __post_init__(self) -> None:
         for field, known in (("scene", SCENES), ("path", (None, *PATHS)), ("heading", HEADINGS)):
@@ -119,6 +120,8 @@ class SyntheticOptions:
             words.append("noisy-poses")
         if self.lens_gap or self.lens_k1:
             words.append("two-lenses")
+        if self.figure:
+            words.append("figure")
         return "-".join(words)
 
     @property

@@ -51,12 +51,13 @@ class Builder:
             "box": Box,
             "rod": Rod,
             "sphere": Sphere,
-            "loose_object": lambda *values: [fu.loose_object(*values, rng)],
+            "loose_object": lambda where, size: [fu.loose_object(where, size, rng)],
+            "crates": lambda dx, y: fu.crates(x + dx, y, rng),
+            "plant": lambda dx, y, height: fu.plant(x + dx, y, height, rng),
         }
-        for make in (fu.table, fu.bookshelf, fu.sofa, fu.floor_lamp, fu.pendant):
+        furniture: list[Callable[..., Any]] = [fu.table, fu.bookshelf, fu.sofa, fu.floor_lamp, fu.pendant]
+        for make in furniture:
             self.functions[make.__name__] = lambda dx, *values, make=make: make(x + dx, *values)
-        for make in (fu.crates, fu.plant):
-            self.functions[make.__name__] = lambda dx, *values, make=make: make(x + dx, *values, rng)
 
     def __call__(self, description: Any) -> Any:
         """Return a texture, a shape or another value."""
@@ -95,7 +96,8 @@ def world(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> W
         nearest = 0.05 if options.nearest is None else options.nearest
         shapes += fu.beside(count, path, nearest, nearest + 0.25, rng)
     else:
-        shapes += fu.scatter(count, path, *build(of["scatter"]), CLEARANCE, rng, of.get("reflectance", 0.0))
+        low, high = build(of["scatter"])
+        shapes += fu.scatter(count, path, low, high, CLEARANCE, rng, of.get("reflectance", 0.0))
     return World(tuple(shapes), Light(build(of["lamps"]), ambient=of.get("ambient", Light.ambient)))
 
 

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from padgs.data.capture import DataError
 from padgs.data.synthetic import camera, paths, scenes
+from padgs.data.synthetic.furniture import person
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.world import World
 from padgs.scene import View
 
-_STREAMS = ("path", "poses", "furniture", "points", "pose noise")
+_STREAMS = ("path", "poses", "furniture", "points", "pose noise", "figure")
+_FIGURE_DISTANCES = (0.8, 2.0)  # metres from the camera, where a camera was or will be
 
 
 class SyntheticTruth:
@@ -37,6 +39,18 @@ class SyntheticTruth:
     def random(self, stream: str) -> np.random.Generator:
         """Return the generator of one purpose, so that options do not change unrelated random numbers."""
         return np.random.default_rng((self.options.seed, _STREAMS.index(stream)))
+
+    def world_seen(self, index: int) -> World:
+        """Return the world as a view shows it: a training view with the walking figure, if there is one."""
+        if not self.options.figure or index in paths.held_out(self.options):
+            return self.world
+        rng = np.random.default_rng((self.options.seed, _STREAMS.index("figure"), index))
+        places = np.array([camera.center(pose)[:2] for pose in self.poses])
+        distance = np.linalg.norm(places - places[index], axis=1)
+        near, far = _FIGURE_DISTANCES
+        free = np.flatnonzero((distance > near) & (distance < far))
+        x, y = places[rng.choice(free) if len(free) else np.argmax(distance)].tolist()
+        return self.world.joined_by(person(x, y, rng.uniform(-np.pi, np.pi)))
 
     @property
     def names(self) -> list[str]:

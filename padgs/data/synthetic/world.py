@@ -8,7 +8,7 @@ floor. Mirror-like materials show one reflection.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -159,6 +159,12 @@ class World:
         """Light maps by shape and face; baked when colours are first needed."""
         flat = [(index, shape) for index, shape in enumerate(self.shapes) if isinstance(shape, Flat)]
         return {(index, face): bake(self, shape, face) for index, shape in flat for face in range(shape.faces)}
+
+    def joined_by(self, shapes: Sequence[Shape]) -> World:
+        """Return the world with more shapes, which cast no shadows."""
+        world = replace(self, shapes=(*self.shapes, *shapes))
+        world.light_maps = self.light_maps
+        return world
 
     def nearest(self, origin: Array, direction: Array, candidates: Sequence[int] | None = None) -> tuple[Array, Array]:
         """Return distance [n] (inf if nothing is hit) and object id [n] (then SKY) of the first hit.

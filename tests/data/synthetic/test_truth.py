@@ -110,3 +110,15 @@ def test_lenses_affect_training_views_only():
     for a, b in zip(plain.train, stitched.train, strict=True):
         assert torch.equal(a.cam_from_world, b.cam_from_world)
         assert (a.image() - b.image()).abs().mean() > 0.005
+
+
+def test_a_figure_walks_through_training_views_only_and_is_not_in_the_depth():
+    plain, walked = generate(SyntheticOptions(**SMALL)), generate(options := SyntheticOptions(**SMALL, figure=True))
+    assert walked.name == "synthetic-bare_room-figure"
+    assert all(torch.equal(a.image(), b.image()) for a, b in zip(plain.test, walked.test, strict=True))
+    places = [SyntheticTruth(options).world_seen(k).shapes[-6].start[:2] for k in (0, 2, 3)]  # of the body
+    assert len(set(places)) == 3
+    for a, b in zip(plain.train, walked.train, strict=True):
+        changed = (a.image() != b.image()).any(-1)
+        assert 0.002 < changed.float().mean() < 0.15
+        assert (changed.float().mean(1) > 0.5).sum() == 0 and torch.equal(a.load_depth(), b.load_depth())
