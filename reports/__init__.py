@@ -3,13 +3,17 @@ beside it, or from the file of published numbers.
 
 `frame` puts all runs into one data frame, a row a run. A report is a function of a `selection.RunSet` (that frame and a
 request) that returns a `Table`, a list of `Chart`s or a page; `writers` turns them into files. Tables are data in
-`specs`, and `build` makes them.
+`tables.yaml`, and `build` makes them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
 
 
 @dataclass(frozen=True)
@@ -20,28 +24,15 @@ class Report:
     experiments: tuple[str, ...] = ()  # of conf/experiment, run for it; none for sweeps and lists of all runs
 
 
-QUALITY_ORDER = ("order", "photographs", "parallax")
-ALL_METHODS = ("table1_360roam", "table2_ricoh360", "table4_efficiency", "all_methods")
-
-_TABLES = {  # of padgs.reports.specs -> experiments
-    "table1": ALL_METHODS,
-    "table2": ALL_METHODS,
-    "table3": ("ablation", "ablation_bar", "ablation_cat_tower"),
-    "table4": ALL_METHODS,
-    "methods": (*ALL_METHODS, "calibration"),
-    "equal_time": ("equal_time",),
-    "ladder": ("ladder",),
-    "deviations": ("deviations",),
-    "order": (*QUALITY_ORDER, "pixel_constants", "all_methods"),
-    "length": ("length",),
-    "learning_rates": ("learning_rates",),
-    "modulation": ("modulation",),
-    "plus_ablation": ("plus_ablation",),
-    "capacity": ("capacity",),
-    "runs": (),
+TABLES: Mapping[str, Mapping[str, Any]] = {  # see `specs.Spec`
+    name: fields
+    for name, fields in yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text("utf-8")).items()
+    if not name.startswith(".")
 }
+QUALITY_ORDER = ("order", "photographs", "parallax")
+ALL_METHODS = tuple(TABLES["table1"]["experiments"])
 REPORTS: Mapping[str, Report] = {
-    **{name: Report(f"padgs.reports.build:table {name}", experiments) for name, experiments in _TABLES.items()},
+    **{name: Report(f"padgs.reports.build:table {name}", (*fields["experiments"],)) for name, fields in TABLES.items()},
     "stability": Report("padgs.reports.robustness:stability", ("stress",)),
     "limits": Report("padgs.reports.robustness:limits", ("stress",)),
     "smallest": Report("padgs.reports.smallest:table", ("smallest",)),

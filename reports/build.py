@@ -1,4 +1,4 @@
-"""Builder of the tables in `padgs.reports.specs`."""
+"""Builder of the tables in `tables.yaml`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from padgs.reports.significance import (
     places,
     unrank,
 )
-from padgs.reports.specs import SPECS
+from padgs.reports.specs import PREPARE, SPECS, TITLES
 from padgs.reports.table import Block, Cell, Column, Row, Table
 
 PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers add
@@ -66,7 +66,7 @@ class _Builder:
         if self.request.metrics and not self.spec.pivot:
             own = {measure.name.rpartition("/")[2]: measure for measure in measures}
             chosen = (own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics)
-            measures = tuple(chosen)
+            measures = list(chosen)
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
         self.unranked: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
@@ -76,7 +76,7 @@ class _Builder:
         single: list[Block] = []
         notes: list[str] = []
         for title, place, runs in self._groups():
-            refuse_mixture(runs, self.request, title, self.spec.conditions)
+            refuse_mixture(runs, self.request, title, self.spec.shared)
             self.shown[title] = runs
             if not (self.spec.scenes_down and place.published and not place.apart):
                 single += self._blocks(title, place, runs)
@@ -112,12 +112,14 @@ class _Builder:
             return run_set.requested
         runs = run_set.chosen(self.name) if spec.fallback else run_set.of_experiments(*REPORTS[self.name].experiments)
         if spec.rows == "variant":
-            runs = runs.loc[runs["variant"].isin([variant for titles in spec.titles.values() for variant in titles])]
+            runs = runs.loc[
+                runs["variant"].isin([variant for titles in TITLES[spec.titles].values() for variant in titles])
+            ]
         elif spec.rows != "setting":  # rows of an ablation and runs that were stopped by hand are not methods
             runs = runs.loc[runs["variant"] == ""]
         if spec.outdoor is not None:
             runs = runs.loc[[place.outdoor is spec.outdoor for place in runs["place"]]]
-        return spec.prepare(runs)
+        return PREPARE[spec.prepare](runs)
 
     def _groups(self) -> Iterator[tuple[str, Place, DataFrame]]:
         """Yield title, scene and runs of each block."""
@@ -139,7 +141,7 @@ class _Builder:
         if spec.rows in ("run", "setting"):
             yield Block(title, self._ranked(runs, title) if spec.by_rank else tuple(self._each_run(runs)))
             return
-        for method, titles in (spec.titles or {"": self._titles(place, runs)}).items():
+        for method, titles in (TITLES[spec.titles] or {"": self._titles(place, runs)}).items():
             if spec.difference and not runs[spec.rows].isin(titles).any():
                 continue
             not_ranked = self.unranked[-1] if self.unranked else ()
@@ -214,7 +216,7 @@ class _Builder:
         heading = f"{title}, average over {words}" if title else f"Average over {count} scenes"
         if not title or len(places) < count:
             heading += f": {', '.join(place.label for place in places)}"
-        refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.conditions if of != "data"])
+        refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.shared if of != "data"])
         self.unranked.append(unranked(runs))
         titles, cells, theirs = self._titles(Place(places[0].dataset, AVERAGE), runs), {}, {}
         settings = runs.drop(columns=[column for column in runs if column.startswith(f"{CONFIG}data.")])
@@ -279,15 +281,15 @@ class _Pivot(_Builder):
         blocks: list[Block] = []
         notes: list[str] = []
         for title, _, runs in self._groups():
-            refuse_mixture(runs, self.request, title, spec.conditions)
+            refuse_mixture(runs, self.request, title, spec.shared)
             self.shown[title] = runs
-            add = self._factors if spec.pivot == ("iterations",) else self._lengths
+            add = self._factors if [*spec.pivot] == ["iterations"] else self._lengths
             blocks += add(title, runs, keys)
         lengths = [f"{key[-1]} iterations" for key in keys]
         headings = [
             ", ".join([words, *(RATES[rates] for rates in key[:-1])]) for key, words in zip(keys, lengths, strict=True)
         ]
-        if spec.pivot == ("iterations",):
+        if [*spec.pivot] == ["iterations"]:
             factors = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
             notes.append(
                 f"The law, √({PUBLISHED_ITERATIONS} / iterations) and at most {LARGEST_FACTOR:g}, gives {factors} "

@@ -1,32 +1,14 @@
-"""Titles of methods and presets in reports, and their order: the paper's, then the others."""
+"""Titles, colours and order of methods and presets (`methods.yaml`): the paper's, then the others."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
-TITLES = {
-    "egonerf": "EgoNeRF",
-    "op43dgs": "OP43DGS",
-    "odgs": "ODGS",
-    "omnigs": "OmniGS",
-    "spags": "SPaGS",
-    "padgs": "PaD-GS",
-    "padgs_plus": "padgs+",
-    "cubemap_3dgs": "3DGS on cube faces",
-    "crops_3dgs": "3DGS on crops",
-    "sc_omnigs": "SC-OmniGS",
-    "seam360gs": "Seam360GS",
-}
-# preset -> how ours differs from the published program, where the name of the preset does not say it
-STATUS = {
-    **dict.fromkeys(("op43dgs", "odgs", "omnigs"), "corrected"),  # the releases, without their mistakes
-    **dict.fromkeys(("op43dgs_release", "odgs_release"), "as released, gradients corrected"),
-    **dict.fromkeys(("omnigs_release", "padgs_release"), "as released"),
-    "sc_omnigs": "after the abstract and project page",
-    "seam360gs": "after the abstract",
-    "spags_narrow": "sorted, narrow filter",
-    "spags_tuned": "sorted, options of padgs+",
-}
+import yaml
+
+METHODS = yaml.safe_load(Path(__file__).with_name("methods.yaml").read_text("utf-8"))
+STATUS = {preset: words for method in METHODS.values() for preset, words in method.get("presets", {}).items()}
 
 
 def method_of(preset: str) -> str:
@@ -35,13 +17,13 @@ def method_of(preset: str) -> str:
     >>> method_of("odgs_release"), method_of("padgs_plus"), method_of("my_own")
     ('odgs', 'padgs_plus', 'my_own')
     """
-    known = [method for method in TITLES if preset == method or preset.startswith(f"{method}_")]
+    known = [method for method in METHODS if preset == method or preset.startswith(f"{method}_")]
     return max(known, key=len, default=preset)
 
 
 def name(method: str) -> str:
     """Return the authors' name of a method, or else its name in the configuration."""
-    return TITLES.get(method, method)
+    return METHODS[method]["title"] if method in METHODS else method
 
 
 def title(preset: str) -> str:
@@ -72,7 +54,7 @@ def ordered(presets: Iterable[str]) -> list[str]:
     >>> ordered(["mine", "padgs", "odgs_release", "odgs", "mine"])
     ['odgs', 'odgs_release', 'padgs', 'mine']
     """
-    ranks = {method: rank for rank, method in enumerate(TITLES)}
+    ranks = {method: rank for rank, method in enumerate(METHODS)}
     return sorted(set(presets), key=lambda preset: (ranks.get(method_of(preset), len(ranks)), preset))
 
 

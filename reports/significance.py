@@ -18,11 +18,6 @@ BEST, SECOND = "best", "second"
 CONFIDENCE = 0.95
 SEEDS = 3  # at least, of a row that is marked as best or second
 WIDEST = 0.02  # largest difference of rows that share a mark, as a share of their number
-NOTE = (
-    f"Bold: best; underlined: second, by at least {SEEDS} seeds. Rows that seeds cannot separate share a place "
-    f"(Welch's t-test, two-sided, {CONFIDENCE:.0%}). A column has no mark from the place on that spans more than "
-    f"{WIDEST:.0%}, or that a row with fewer seeds could take."
-)
 
 
 def unrank(cells: Sequence[Cell]) -> list[Cell]:
@@ -66,7 +61,7 @@ def mean_cell(values: Sequence[float], failed: str = "") -> Cell:
 
 
 def marks(block: Block, columns: tuple[Column, ...]) -> list[dict[int, str]]:
-    """Return row -> BEST or SECOND for each column of a block; see `NOTE`."""
+    """Return row -> BEST or SECOND for each column of a block; see the notes in `tables.yaml`."""
     if block.across is None:
         return [emphasis(block, index, columns) for index in range(len(columns))]
     rows = [
@@ -76,7 +71,7 @@ def marks(block: Block, columns: tuple[Column, ...]) -> list[dict[int, str]]:
 
 
 def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int, str]:
-    """Return row -> BEST or SECOND for the column `index` of a block; see `NOTE`.
+    """Return row -> BEST or SECOND for the column `index` of a block; see the notes in `tables.yaml`.
 
     Cells that are not `ranked` are left out. Nothing is highlighted without a direction, or if all rows tie.
     """

@@ -14,30 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from padgs.reports.methods import method_of
+from padgs.reports.methods import METHODS, method_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
-# The first five are Okabe and Ito's, which colour-blind readers can tell apart. Only PaD-GS and padgs+ are pink.
-FAMILIES = {
-    "egonerf": "#e69f00",
-    "op43dgs": "#56b4e9",
-    "odgs": "#009e73",
-    "omnigs": "#d55e00",
-    "spags": "#0072b2",
-    "padgs": "#cc79a7",
-    "padgs_plus": "#b0005e",
-    "cubemap_3dgs": "#333333",
-    "crops_3dgs": "#8c6d31",
-    "sc_omnigs": "#7f7f7f",
-    "seam360gs": "#332288",
-}
 OTHERS = ("#44aa99", "#999933", "#882255")
 INK = "#1d2330"
 SOFT = "#5b6475"
 GRID = "#e3e6eb"
 PAPER = "#ffffff"
-COLORS = (*FAMILIES.values(), *OTHERS)
+COLORS = (*(method["color"] for method in METHODS.values()), *OTHERS)
 ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
@@ -149,9 +135,9 @@ def show_image(panel: Any, image: Any, title: str) -> None:
 
 def color_of(preset: str, presets: Sequence[str]) -> str:
     """Return the colour of a preset's method; methods without one get theirs by their order in `presets`."""
-    if method_of(preset) in FAMILIES:
-        return FAMILIES[method_of(preset)]
-    others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in FAMILIES]
+    if method_of(preset) in METHODS:
+        return METHODS[method_of(preset)]["color"]
+    others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in METHODS]
     return OTHERS[others.index(method_of(preset)) % len(OTHERS)]
 
 

@@ -36,11 +36,6 @@ class Point:
     preset: str
     numbers: dict[str, Cell]  # title of a column -> number
 
-    @property
-    def gaussians(self) -> float:
-        """The number of Gaussians; 0 for methods without any."""
-        return self.numbers["Gaussians"].value or 0.0
-
     def value(self, measure: Measure) -> float | None:
         """Return a finite number, or None."""
         value = self.numbers[measure.column.title].value

@@ -34,7 +34,7 @@ from padgs.reports.selection import RunSet, Setting, settings
 FRAME_TIME = ("frame_ms", "time per frame", "ms")  # cost, words, unit
 TRAINING_TIME, CPU_TIME = ("train_seconds", "training time", "s"), ("cpu_seconds", "training time on the CPU", "s")
 SIZE, TIME_SIZE = (5.3, 4.6), (10.6, 4.2)  # inches of a panel, and of a chart of quality over time
-LARGEST, SMALLEST, FIXED = 300.0, 25.0, 30.0  # points^2 of marks: most Gaussians, few, and without such a meaning
+AREA, SMALL_AREA = 90.0, 30.0  # points^2 of marks, and of those of releases
 LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line over time
     "main": {"linewidth": 1.3, "zorder": 2.2},
     "variant": {"linewidth": 0.9, "zorder": 2.1},
@@ -55,9 +55,14 @@ class Mark:
     y: float  # quality
 
     @property
-    def gaussians(self) -> float:
-        """The number that its area shows: 0 for releases and for methods without Gaussians."""
-        return 0.0 if self.role == "release" else self.point.gaussians
+    def area(self) -> float:
+        """Points^2."""
+        return SMALL_AREA if self.role == "release" else AREA
+
+    @property
+    def radius(self) -> float:
+        """Points."""
+        return math.sqrt(self.area) / 2
 
 
 def charts(run_set: RunSet) -> list[Chart]:
@@ -74,8 +79,8 @@ def equal_time_charts(run_set: RunSet) -> list[Chart]:
 def chart(trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()) -> Chart:
     """Return panels with a common axis of quality and a label at each mark, by default of training and of frame time.
 
-    Axes show where methods differ (`axis.window`); a note names the marks beyond. The area of a mark is proportional to
-    the number of Gaussians. Releases are small rings, and not in the Pareto front. Variants are faint.
+    Axes show where methods differ (`drawing.window`); a note names the marks beyond. Releases are small rings, outside
+    of the Pareto front. Variants are faint.
     """
     made, panels = draw(trade_off, shown)
     notes = (*trade_off.notes, *_beyond((axes, marks, unit) for axes, marks, unit, _ in panels))
@@ -91,8 +96,6 @@ def draw(
     shown = shown or (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
     made, axes = figure(len(shown), 1, *SIZE)
     marks = [_marks(trade_off, cost) for cost, _, _ in shown]
-    counts = [mark.gaussians for of in marks for mark in of if mark.gaussians]
-    scale = LARGEST / max([1.0, *counts])
     presets = [point.preset for point in trade_off.points]
     for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
         panel.set_xlabel(f"{words}, {unit} ↓")
@@ -102,15 +105,14 @@ def draw(
         rivals = [m for m in own if m.role != "release" and m.point.preset not in trade_off.unranked]
         _draw_front(panel, [(mark.x, mark.y) for mark in rivals])
         for mark in own:
-            _draw(panel, trade_off, mark, COSTS[cost].column.title, scale, presets)
+            _draw(panel, trade_off, mark, COSTS[cost].column.title, presets)
     units = (unit for _, _, unit in shown)
     beyond = wrap(" ".join(_beyond(zip(axes.flat, marks, units, strict=True))), LINE * len(shown))
     look = {"title": "\n".join([_conditions(trade_off), *beyond]), "ncols": 8, "fontsize": 8, "title_fontsize": 8}
-    made.legend(handles=_handles([mark for of in marks for mark in of], scale), loc="outside lower center", **look)
+    made.legend(handles=_handles([mark for of in marks for mark in of]), loc="outside lower center", **look)
     lay_out(made, trade_off.title)
     return made, [
-        (panel, own, unit, _label(panel, own, scale))
-        for panel, own, (_, _, unit) in zip(axes.flat, marks, shown, strict=True)
+        (panel, own, unit, _label(panel, own)) for panel, own, (_, _, unit) in zip(axes.flat, marks, shown, strict=True)
     ]
 
 
@@ -206,12 +208,7 @@ def _inside(panel: Any, mark: Mark) -> bool:
     return left <= mark.x <= right and bottom <= mark.y <= top
 
 
-def _area(mark: Mark, scale: float) -> float:
-    """Return points^2, with `scale` points^2 per Gaussian."""
-    return max(scale * mark.gaussians, SMALLEST) if mark.gaussians else FIXED
-
-
-def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, scale: float, presets: Sequence[str]) -> None:
+def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, presets: Sequence[str]) -> None:
     """Draw a mark, with its standard deviation along both axes."""
     color, numbers = color_of(mark.point.preset, presets), mark.point.numbers
     x_std, y_std = numbers[cost].std, numbers[trade_off.quality.column.title].std
@@ -225,8 +222,8 @@ def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, scale: float, 
     else:
         ours = weight_of(mark.point.preset, mark.role) == "bold"
         edge = {"edgecolors": INK, "linewidths": 1.2} if ours else {"edgecolors": PAPER, "linewidths": 0.5}
-        look |= {"facecolors": color, "marker": "o" if mark.gaussians else "D", **edge}
-    panel.scatter(mark.x, mark.y, s=_area(mark, scale), **look)
+        look |= {"facecolors": color, **edge}
+    panel.scatter(mark.x, mark.y, s=mark.area, **look)
 
 
 def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
@@ -238,14 +235,14 @@ def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
         panel.plot(*zip(*steps, strict=True), color=SOFT, linewidth=0.9, zorder=1.5)
 
 
-def _label(panel: Any, marks: Sequence[Mark], scale: float) -> list[Any]:
+def _label(panel: Any, marks: Sequence[Mark]) -> list[Any]:
     """Write labels, main presets first, and return the texts; call it when the layout is fixed."""
-    inside = [(mark, math.sqrt(_area(mark, scale)) / 2) for mark in marks if _inside(panel, mark)]
+    inside = [mark for mark in marks if _inside(panel, mark)]
     labels = [
-        Label(methods.short(m.point.title, m.point.preset), (m.x, m.y), radius, weight_of(m.point.preset, m.role))
-        for m, radius in sorted(inside, key=lambda of: of[0].role != "main")
+        Label(methods.short(m.point.title, m.point.preset), (m.x, m.y), m.radius, weight_of(m.point.preset, m.role))
+        for m in sorted(inside, key=lambda mark: mark.role != "main")
     ]
-    return write_labels(panel, labels, [(mark.x, mark.y, radius) for mark, radius in inside])
+    return write_labels(panel, labels, [(mark.x, mark.y, mark.radius) for mark in inside])
 
 
 def brief(value: float) -> str:
@@ -257,25 +254,19 @@ def brief(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def _handles(marks: Sequence[Mark], scale: float) -> list[Any]:
+def _handles(marks: Sequence[Mark]) -> list[Any]:
     """Return the legend of what is drawn."""
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import EngFormatter
 
-    def dot(size: float, label: str, **look: Any) -> Line2D:
+    def dot(area: float, label: str, **look: Any) -> Line2D:
         look = {"marker": "o", "color": SOFT, "markeredgewidth": 0} | look
-        return Line2D([], [], linestyle="none", markersize=math.sqrt(size), label=label, **look)
+        return Line2D([], [], linestyle="none", markersize=math.sqrt(area), label=label, **look)
 
-    counts = [mark.gaussians for mark in marks if mark.gaussians]
-    examples = dict.fromkeys((_round(min(counts)), _round(max(counts)))) if counts else ()
-    sizes = {count: max(scale * count, SMALLEST) for count in examples}
-    handles = [dot(size, f"{EngFormatter(sep='')(count)} Gaussians") for count, size in sizes.items()]
-    if any(mark.role != "release" and not mark.gaussians for mark in marks):
-        handles.append(dot(FIXED, "without Gaussians", marker="D"))
+    handles = []
     if any(mark.role == "variant" for mark in marks):
-        handles.append(dot(90.0, "variant of a method", alpha=ALPHA["variant"]))
+        handles.append(dot(AREA, "variant of a method", alpha=ALPHA["variant"]))
     if any(mark.role == "release" for mark in marks):
-        handles.append(dot(FIXED, "program as released", markerfacecolor="none", markeredgewidth=1.0))
+        handles.append(dot(SMALL_AREA, "program as released", markerfacecolor="none", markeredgewidth=1.0))
     return [*handles, Line2D([], [], color=SOFT, linewidth=0.9, label="Pareto front")]
 
 
@@ -287,13 +278,3 @@ def _conditions(trade_off: TradeOff) -> str:
         parts += [known[0]] if len(known) == 1 else []
     seeds = trade_off.runs["seed"].nunique()
     return ", ".join([*parts, *([f"bars: standard deviation over {seeds} seeds"] if seeds > 1 else [])])
-
-
-def _round(count: float) -> float:
-    """Return the largest of 1, 2, 5, 10, ... up to a count.
-
-    >>> _round(344_000), _round(105_000)
-    (200000.0, 100000.0)
-    """
-    decade = 10.0 ** math.floor(math.log10(count))
-    return decade * max(digit for digit in (1, 2, 5) if digit * decade <= count)

@@ -11,7 +11,6 @@ from padgs.reports.charts import sweep_chart, trade_off_chart
 from padgs.reports.charts.drawing import (
     BESIDE,
     COLORS,
-    FAMILIES,
     Label,
     color_of,
     figure,
@@ -20,7 +19,7 @@ from padgs.reports.charts.drawing import (
     window,
     write_labels,
 )
-from padgs.reports.methods import method_of
+from padgs.reports.methods import METHODS, method_of
 
 RADIUS = 5.0  # points
 values = st.lists(st.floats(0.01, 1e4), min_size=1, max_size=20)
@@ -28,7 +27,7 @@ values = st.lists(st.floats(0.01, 1e4), min_size=1, max_size=20)
 
 def test_every_method_has_its_own_colour(root):
     presets = {*baselines.BUILT_IN, *(path.stem for path in (root / "conf" / "method").glob("*.yaml"))}
-    assert {method_of(preset) for preset in presets} <= FAMILIES.keys(), "give new methods a line in FAMILIES"
+    assert {method_of(preset) for preset in presets} <= METHODS.keys(), "give new methods a line in methods.yaml"
     assert len(set(COLORS)) == len(COLORS)
 
 

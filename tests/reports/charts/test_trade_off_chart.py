@@ -8,7 +8,7 @@ from support.made_up import assert_apart, compared, of_experiment, run_set, smal
 from padgs.reports import store
 from padgs.reports.charts import trade_off_chart
 from padgs.reports.charts.trade_off import trade_offs
-from padgs.reports.charts.trade_off_chart import LARGEST, NAMED, chart, charts, draw, equal_time_charts, time_chart
+from padgs.reports.charts.trade_off_chart import NAMED, chart, charts, draw, equal_time_charts, time_chart
 from padgs.reports.frame import frame
 from padgs.reports.methods import short
 from padgs.reports.selection import RunSet
@@ -68,13 +68,11 @@ def scatters(panel):
     return [found for found in panel.collections if isinstance(found, PathCollection)]
 
 
-def test_the_area_is_the_number_of_gaussians_and_bars_are_the_spread():
+def test_bars_are_the_spread_of_seeds():
     runs = [
         small(25 + seed, cost, method=m, seed=seed) for m, cost in (("odgs", 1.0), ("spags", 3.0)) for seed in (0, 1)
     ]
     _, ((panel, *_), _) = draw(one(runs))
-    small_one, large_one = (found.get_sizes()[0] for found in scatters(panel))
-    assert large_one / small_one == pytest.approx(3) and large_one == LARGEST
     bars = [
         segment for lines in panel.collections if hasattr(lines, "get_segments") for segment in lines.get_segments()
     ]
