@@ -40,6 +40,7 @@ from padgs.multirun.job import (
     OK,
     REFUSED,
     RUNNING,
+    STOPPED,
     UNFINISHED,
     WAITING,
     Board,
@@ -49,6 +50,7 @@ from padgs.multirun.job import (
     job_of_many,
 )
 from padgs.multirun.overrides import expand
+from padgs.multirun.slurm import wait_for_jobs
 from padgs.results import Result, ResultError
 from padgs.runs.config import RunOptions
 from padgs.runs.console import Display, compact, duration, psnr_of, say, write
@@ -189,7 +191,7 @@ class Multirun:
             display = Display(self._console, redraw=0.0, line=SECONDS_BETWEEN_LINES)
             with Interrupt() as stop, display, repeated(lambda: self._tick(stop, display)):
                 try:
-                    launch(launcher, jobs, first_number)
+                    launch(launcher, jobs, first_number, self.board)
                 finally:  # a closed terminal ends workers that are still being imported, too
                     self._tick(stop, display)
         except Exception as error:
@@ -288,7 +290,7 @@ def summary(status: str, result: Result | None) -> list[str]:
     return [*parts, f"trained {duration(result.timing.get('train_seconds', 0))}"]
 
 
-def launch(launcher: Any, jobs: list[list[str]], first_number: int) -> None:
+def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board) -> None:
     """Run jobs with a launcher of Hydra and wait for all of them, even if the process of one has died.
 
     The launchers of submitit raise the error of the first dead job and leave the others unobserved, so their jobs are
@@ -314,7 +316,12 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int) -> None:
     executor.update_parameters(**{key if key in common else f"{cluster}_{key}": parameters[key] for key in parameters})
     ids = (f"job_id_for_{first_number + position}" for position in range(len(jobs)))
     state, key = repeat(Singleton.get_state(), len(jobs)), repeat("hydra.sweep.dir", len(jobs))
-    for job in executor.map_array(launcher, jobs, key, range(first_number, first_number + len(jobs)), ids, state):
+    submitted = executor.map_array(launcher, jobs, key, range(first_number, first_number + len(jobs)), ids, state)
+    if cluster == "slurm":
+        for position in wait_for_jobs(submitted, board.stop_requested):
+            board.write(first_number + position, JobState(STOPPED, reason="it left the queue of Slurm before it began"))
+        return
+    for job in submitted:
         with suppress(Exception):  # a job without results died; the board tells which
             job.results()
 

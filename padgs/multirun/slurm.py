@@ -1,0 +1,40 @@
+"""Jobs in Slurm's queue: wait until they have left it, and remove those that have not begun."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+SECONDS_BETWEEN_QUERIES = 10.0
+
+
+def wait_for_jobs(jobs: Sequence[Any], stop_requested: Callable[[], bool]) -> list[int]:
+    """Wait until submitit's jobs have left the queue; if a stop is requested, take those that wait out of it.
+
+    submitit asks `sacct`, which answers nothing on clusters without accounting, and takes preempted jobs for ended ones
+    that Slurm has put back into the queue.
+
+    Returns:
+        Positions of jobs that were cancelled before they began.
+    """
+    cancelled = False
+    while (left := queued()) is None or left & {job.job_id for job in jobs}:
+        if not cancelled and stop_requested():
+            cancelled = cancel_pending(job.job_id for job in jobs)
+        time.sleep(SECONDS_BETWEEN_QUERIES)
+    return [position for position, job in enumerate(jobs) if not job.paths.stdout.exists()]
+
+
+def queued() -> set[str] | None:
+    """Return the ids of this user's jobs that wait or run, as JOB or JOB_INDEX; None if Slurm does not answer."""
+    command = ["squeue", "--me", "--noheader", "--array", "--format=%i"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    return {*answer.stdout.split()} if answer.returncode == 0 else None
+
+
+def cancel_pending(ids: Iterable[str]) -> bool:
+    """Cancel the jobs that have not begun; return whether Slurm did so."""
+    arrays = sorted({number.partition("_")[0] for number in ids})
+    return subprocess.run(["scancel", "--state=PENDING", *arrays], capture_output=True, check=False).returncode == 0
