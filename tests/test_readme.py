@@ -1,6 +1,4 @@
-"""Every command in README and in the docs that walk through commands is understood by the program it names; the quick
-ones are run.
-"""
+"""Commands in the README and in the pages with commands are understood by their programs; the quick ones are run."""
 
 import os
 import re
@@ -18,8 +16,11 @@ from padgs.multirun.overrides import missing_plugin
 from padgs.reports import REPORTS
 
 ROOT = Path(__file__).resolve().parent.parent
-README = (ROOT / "README.md").read_text()
-TEXT = README + "".join((ROOT / "docs" / name).read_text() for name in ("cluster.md", "your_photographs.md"))
+README, QUICKSTART, CONTRIBUTING, *WALKS = (
+    (ROOT / name).read_text()
+    for name in ("README.md", "docs/quickstart.md", "CONTRIBUTING.md", "docs/cluster.md", "docs/your_photographs.md")
+)
+TEXT = "".join((README, QUICKSTART, *WALKS))
 COMMANDS = [
     line.removeprefix(".venv/bin/")
     for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)
@@ -38,7 +39,7 @@ def padgs_root(monkeypatch):
 
 
 def test_every_report_stands_in_its_table():
-    rows = re.search(r"\| report \| content \|.*?\n\n", README, re.DOTALL)
+    rows = re.search(r"\| report \| content \|.*?\n\n", QUICKSTART, re.DOTALL)
     assert rows
     names = [name for row in rows[0].split("\n|")[2:] for name in re.findall(r"`(\w+)`", row.partition("|")[0])]
     assert sorted(names) == sorted(REPORTS)
@@ -77,7 +78,7 @@ def test_requirement_files_exist(command):
 
 
 @pytest.mark.parametrize(
-    "path", sorted(set(re.findall(r"`((?:padgs|baselines|conf|reports)/[\w./]*\w\.\w+)`", README)))
+    "path", sorted(set(re.findall(r"`((?:padgs|baselines|conf|reports)/[\w./]*\w\.\w+)`", README + CONTRIBUTING)))
 )
 def test_files_that_are_named_exist(path):
     assert (ROOT / path).exists() or "yours" in path
@@ -107,7 +108,7 @@ def test_the_smoke_experiment_is_reported(smoke):
 
 def test_the_lines_of_python_run(smoke):
     """As written, but on the run of the smoke experiment and a scene that is as small."""
-    (lines,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    (lines,) = re.findall(r"```python\n(.*?)```", QUICKSTART, re.DOTALL)
     small = {"train_views": 3, "test_views": 1, "samples": 1, "points": 300, "width": 64}
     run = next((smoke / "runs").glob("*/result.json")).parent
     exchanged = {

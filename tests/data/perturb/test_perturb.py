@@ -43,9 +43,9 @@ def test_the_table_has_three_levels_each_and_limits_that_rise():
 
 
 def test_the_docs_list_every_condition(root):
-    rows = [line.replace(" †", "") for line in (root / "docs" / "stability.md").read_text().splitlines()]
+    rows = [line.replace(" †", "") for line in (root / "docs" / "robustness.md").read_text().splitlines()]
     missing = [f"| `{name}` | {' | '.join(c.row())} |" for name, c in CONDITIONS.items()]
-    assert [row for row in missing if row not in rows] == [], "copy these rows into docs/stability.md"
+    assert [row for row in missing if row not in rows] == [], "copy these rows into docs/robustness.md"
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
