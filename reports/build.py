@@ -43,11 +43,7 @@ RATES = {"published": "published rates", "run": "rates for the run"}
 
 
 def table(run_set: RunSet, name: str) -> Table:
-    """Return the table of a name in `SPECS`.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
-    """
+    """Return the table of a name in `SPECS`."""
     return (_Pivot if SPECS[name].pivot else _Builder)(run_set, name).build()
 
 

@@ -131,9 +131,6 @@ def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
     correction for all claims.
 
     A claim holds (is not reproduced) if the mean is significantly positive (negative), and every scene is likewise.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
     """
     found = [Evidence(claim, measured(claim, run_set)) for claim in claims]
     found = [replace(one, p=float(_test(one.tested["advantage"]).pvalue)) if one.interval else one for one in found]
@@ -194,11 +191,7 @@ def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, fl
 
 
 def findings(run_set: RunSet) -> Page:
-    """Return the page: verdicts in words, a table with the evidence, and the rules.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
-    """
+    """Return the page: verdicts in words, a table with the evidence, and the rules."""
     numbers, tested = published.load(), judge(load(), run_set)
     paper = [one.verdict for one in tested if one.claim.source != OURS]
     every = dict.fromkeys([HOLDS, *sorted(one.verdict for one in tested)])

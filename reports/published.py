@@ -77,7 +77,11 @@ class Place:
 
     @property
     def stem(self) -> str:
-        """Unique label for file names: with the data set, unless the name of the scene says it."""
+        """Unique label for file names: with the data set, unless the name of the scene says it.
+
+        >>> Place("", "room").stem, Place("omniblender", "room").stem, Place("synthetic", "synthetic-room").stem
+        ('room', 'room_omniblender', 'synthetic-room')
+        """
         implied = BUILT_IN if self.scene.startswith(f"{BUILT_IN}-") else ""
         return self.label if self.dataset == implied else f"{self.label}_{self.dataset or 'capture'}"
 

@@ -157,11 +157,7 @@ class StressedMethod:
 
 
 def stressed_methods(run_set: RunSet) -> dict[str, list[StressedMethod]]:
-    """Return title of a scene -> methods run with and without stress, sorted by worst quartile, incomplete ones last.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
-    """
+    """Return title of a scene -> methods run with and without stress, by worst quartile, incomplete ones last."""
     runs, found = run_set.of_experiments("stress"), {}
     if not {CONDITION, QUALITY, ONE_COLOR} <= {*runs}:
         return found
@@ -185,11 +181,7 @@ def all_stress(stressed: Sequence[StressedMethod]) -> list[Stress]:
 
 
 def stability(run_set: RunSet) -> list[Table | Chart]:
-    """Return a table with three blocks for each scene, and a heat map for each.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
-    """
+    """Return a table with three blocks for each scene, and a heat map for each."""
     found = stressed_methods(run_set)
     presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
     blocks = []
@@ -219,11 +211,7 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
 
 
 def limits(run_set: RunSet) -> Table:
-    """Return what methods lose under stress beside what is allowed, for scenes with the size and length of the limits.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
-    """
+    """Return what methods lose under stress beside what is allowed, for scenes of the limits' size and length."""
     found = {title: [one for one in those if _has_limits(one)] for title, those in stressed_methods(run_set).items()}
     found = {title: those for title, those in found.items() if those}
     presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))

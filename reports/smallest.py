@@ -144,11 +144,7 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
 
 
 def table(run_set: RunSet) -> Table:
-    """Return a block for each scene, resolution and length, and a row for each method whose runs were searched.
-
-    Raises:
-        ReportError: runs must not be compared, or are mixed in a cell.
-    """
+    """Return a block for each scene, resolution and length, and a row for each method whose runs were searched."""
     blocks, shown = [], {}
     for title, own in by_conditions(searched(run_set), "resolution", "length").items():
         refuse_mixture(own, run_set.request, title, OF_TIMES)
@@ -167,11 +163,7 @@ def _over_seeds(values: Iterable[float | None]) -> Cell:
 
 
 def charts(run_set: RunSet) -> list[Chart]:
-    """Return a chart for each scene with a search for the smallest model, and one of test views if there are renders.
-
-    Raises:
-        ReportError: the results of a chart differ in protocol, resolution, length, learning rates, data or machine.
-    """
+    """Return a chart for each scene that was searched, and one of test views if there are renders."""
     found = []
     for title, own in by_conditions(searched(run_set), "resolution", "length").items():
         refuse_mixture(own, run_set.request, title, OF_TIMES)

@@ -21,11 +21,7 @@ COLUMNS = 3
 
 
 def charts(run_set: RunSet) -> list[Chart]:
-    """Return a sheet for each scene, resolution and length with renders of test views; one seed is enough.
-
-    Raises:
-        ReportError: the results of a sheet differ in protocol or data.
-    """
+    """Return a sheet for each scene, resolution and length with renders of test views; one seed is enough."""
     runs, found = run_set.chosen("gallery"), []
     runs = runs.loc[runs["ok"] & (runs["variant"] == "") & (runs["renders"].map(render_names).map(len) > 0)]
     for where, own in by_conditions(runs, "resolution", "length").items():

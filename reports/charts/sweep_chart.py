@@ -79,9 +79,6 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
     """Return the sweeps in which a preset was run on a scene in several settings, ad-hoc runs included.
 
     Experiments of tables are left out, unless the request names one.
-
-    Raises:
-        ReportError: unknown metric, or results that differ in protocol, machine or data.
     """
     request, runs = run_set.request, run_set.requested
     measures = _measures(request, runs)

@@ -87,11 +87,7 @@ class TradeOff:
 
 
 def trade_offs(run_set: RunSet) -> list[TradeOff]:
-    """Return a chart for each data set of the paper and for each other scene; warn where no scene is complete.
-
-    Raises:
-        ReportError: the results of a chart differ in protocol, resolution, learning rates, data or machine.
-    """
+    """Return a chart for each data set of the paper and for each other scene; warn where no scene is complete."""
     runs = run_set.chosen("chart")
     groups: dict[str, dict[Place, DataFrame]] = {}
     for place, own in by_place(runs.loc[runs["variant"] == ""]).items():
@@ -114,11 +110,7 @@ def trade_offs(run_set: RunSet) -> list[TradeOff]:
 
 
 def equal_times(run_set: RunSet) -> list[TradeOff]:
-    """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods.
-
-    Raises:
-        ReportError: the results of a chart differ in protocol, resolution, learning rates, data or machine.
-    """
+    """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods."""
     runs, found = run_set.of_experiments("equal_time"), []
     shown = replace(run_set.request, protocol=_protocol(runs))
     for title, own in by_conditions(runs.loc[runs["variant"] == ""], "resolution", "length").items():

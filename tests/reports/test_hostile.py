@@ -191,16 +191,16 @@ def test_long_names_of_scenes_give_files(tmp_path):
 
 def test_reports_at_the_same_time_lose_no_run(tmp_path):
     """Each collects runs of its own into one store."""
-    out, made = tmp_path / "out", [small(20 + n / 10, seed=n) for n in range(18)]
-    folders = [write(made[n : n + 3], tmp_path / f"runs{n}") for n in range(0, 18, 3)]
-    code = "import sys; from pathlib import Path; from padgs.reports import store\n"
+    out, made = tmp_path / "out", [small(20 + n / 10, seed=n) for n in range(15)]
+    folders = [write(made[n : n + 5], tmp_path / f"runs{n}") for n in range(0, 15, 5)]
+    code = "import sys, time; from pathlib import Path; from padgs.reports import store\n"
     code += "runs, out, go = store.read(Path(sys.argv[1]))[0], Path(sys.argv[2]), Path(sys.argv[3])\n"
-    code += "while not go.exists(): pass\n"
+    code += "while not go.exists(): time.sleep(0.01)\n"
     code += "[store.add([run], out / store.FILE_NAME) for run in runs]"
     out.mkdir()
     go = tmp_path / "go"
     started = [subprocess.Popen([sys.executable, "-c", code, folder, out, go]) for folder in folders]
-    time.sleep(5)
+    time.sleep(2)
     go.touch()
     assert [process.wait() for process in started] == [0] * len(started)
     assert len(store.read(out / store.FILE_NAME)[0]) == len(made)

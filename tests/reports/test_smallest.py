@@ -95,13 +95,6 @@ def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     assert list(chart.numbers["smallest for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
 
 
-def test_charts_of_scenes_of_two_data_sets_have_names_of_their_own():
-    datasets = ("", "omniblender")
-    made = [small(30.0, scene="room", dataset=one, run=f"of-{one}", smallest=found(30.0)) for one in datasets]
-    names = [chart.name for chart in charts(run_set(made))]
-    assert names == ["smallest_room_512x256_1500-iterations", "smallest_room_omniblender_512x256_1500-iterations"]
-
-
 def test_a_test_view_is_shown_at_each_size_where_there_is_an_image_of_it(tmp_path):
     found = run_set(runs())
     assert len(charts(found)) == 1

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from support.made_up import compared, small, write
+from support.made_up import compared, write
 
 from padgs.reports import store
 from padgs.reports.charts import gallery
@@ -32,12 +32,6 @@ def test_each_scene_has_a_sheet_with_each_method_once_by_falling_psnr(tmp_path):
     titles = ("ground truth", "PaD-GS: 26.00 dB", "SPaGS: 25.20 dB", "EgoNeRF: 22.00 dB")
     places = [indoors.index(title) for title in titles]
     assert places == sorted(places)
-
-
-def test_scenes_of_two_data_sets_have_different_names(tmp_path):
-    runs = [small(25.0, scene="room", dataset=dataset, run=f"of-{dataset}") for dataset in ("", "omniblender")]
-    names = [chart.name for chart in sheets(write(runs, tmp_path, renders=True))]
-    assert names == [f"gallery_{stem}_512x256_1500-iterations" for stem in ("room", "room_omniblender")]
 
 
 def test_runs_without_a_readable_render_are_left_out(tmp_path):

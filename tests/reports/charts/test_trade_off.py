@@ -1,10 +1,130 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from support.made_up import METHODS, compared, data_set, run_set, small
+from support.made_up import METHODS, assert_apart, compared, data_set, of_experiment, run_set, small, write
 
+from padgs.reports import store
+from padgs.reports.charts import trade_off_chart
 from padgs.reports.charts.trade_off import pareto, trade_offs
+from padgs.reports.charts.trade_off_chart import NAMED, chart, charts, draw, equal_time_charts, time_chart
+from padgs.reports.frame import frame
+from padgs.reports.methods import short
+from padgs.reports.selection import RunSet
 from padgs.reports.table import ReportError
+
+
+def one(runs):
+    (made,) = trade_offs(run_set(runs))
+    return made
+
+
+def crowd(count: int):
+    """Return runs of methods with similar numbers, the first far below and slow."""
+    presets = ["egonerf_small", "padgs", "padgs_release", "padgs_ray", "odgs", "odgs_release", "spags", "spags_sorted"]
+    presets += [f"method{n}" for n in range(count - len(presets))]
+    return [
+        small(28 + 0.2 * n + (n % 3) - 12 * (n == 0), 1 + 0.1 * (n * 7 % count) + 300 * (n == 0), method=preset)
+        for n, preset in enumerate(presets[:count])
+    ]
+
+
+@pytest.mark.parametrize("count", [1, 2, 20])
+def test_all_methods_within_the_axes_have_labels_that_do_not_touch(count):
+    for panel, marks, _, texts in draw(one(crowd(count)))[1]:
+        shown = {
+            short(mark.point.title, mark.point.preset) for mark in marks if count < 3 or "ego" not in mark.point.preset
+        }
+        assert {text.get_text() for text in texts} == shown
+        assert_apart(panel, texts)
+
+
+def test_axes_show_where_methods_differ_and_a_note_names_those_beyond():
+    made = one(crowd(12))
+    for panel, marks, _, texts in draw(made)[1]:
+        low, high = panel.get_ylim()
+        assert high - low < 8 and panel.get_xlim()[1] < 1000
+        assert [mark.point.preset for mark in marks if not low < mark.y < high] == ["egonerf_small"]
+        assert not any("EgoNeRF" in text.get_text() for text in texts)
+    assert "Beyond the axes: EgoNeRF, small (15.6 dB, " in "".join(chart(made).notes)
+    (legend,) = draw(made)[0].legends
+    assert "Beyond the axes: EgoNeRF, small (15.6 dB, " in legend.get_title().get_text(), "of a picture read alone"
+
+
+def test_releases_are_small_rings_and_not_in_the_front():
+    runs = [small(25.0, 2.0, method="odgs"), small(30.0, 0.5, method="odgs_release"), small(24.0, 1.0, method="padgs")]
+    _, ((panel, marks, _, _), _) = draw(one(runs))
+    looks = {m.point.preset: c for m, c in zip(marks, scatters(panel), strict=True)}
+    ring, full = looks["odgs_release"], looks["odgs"]
+    assert len(ring.get_facecolor()) == 0 and ring.get_alpha() < full.get_alpha()
+    assert ring.get_sizes()[0] < full.get_sizes()[0]
+    front = panel.lines[0].get_xydata()
+    assert front.tolist()[0] == [100, 23.6] and front[-1, 1] == 24.6, "the release is better and cheaper"
+
+
+def scatters(panel):
+    from matplotlib.collections import PathCollection
+
+    return [found for found in panel.collections if isinstance(found, PathCollection)]
+
+
+def test_bars_are_the_spread_of_seeds():
+    runs = [
+        small(25 + seed, cost, method=m, seed=seed) for m, cost in (("odgs", 1.0), ("spags", 3.0)) for seed in (0, 1)
+    ]
+    _, ((panel, *_), _) = draw(one(runs))
+    bars = [
+        segment for lines in panel.collections if hasattr(lines, "get_segments") for segment in lines.get_segments()
+    ]
+    heights = [abs(end[1] - start[1]) for start, end in bars]
+    assert heights.count(pytest.approx(np.sqrt(2))) == 2
+
+
+def test_a_chart_names_its_marks_and_axes():
+    (made,) = charts(run_set(compared(["synthetic-room"])))
+    assert ">PaD-GS<" in made.svg
+    assert ">time per frame, ms ↓<" in made.svg and made.png.startswith(b"\x89PNG")
+
+
+def test_after_equal_time_only_the_time_per_frame_is_a_cost():
+    budget = {"seconds": 60.0, "clock": "cpu"}
+    runs = [
+        replace(run := of_experiment("equal_time", 25.0, preset=method), config=run.config | {"budget": budget})
+        for method in ("odgs", "omnigs", "spags")
+    ]
+    (made,) = equal_time_charts(run_set(runs))
+    assert made.name == "equal_time_synthetic-room_512x256_60-s-of-CPU-time" and len(made.figure.axes) == 1
+    assert ">time per frame, ms ↓<" in made.svg and equal_time_charts(run_set(runs[:2])) == []
+
+
+def test_quality_over_training_time_comes_from_the_logs(tmp_path, monkeypatch):
+    named = []
+    monkeypatch.setattr(trade_off_chart, "write_labels", lambda _, labels, __: named.append(labels))
+    runs = compared(["synthetic-room"], seeds=2)
+    runs.append(replace(small(20.0, method="mine", experiments=("all_methods",)), status="oom"))
+    (logged,) = trade_offs(RunSet(frame(store.read(write(runs, tmp_path))[0])))
+    made = time_chart(logged)
+    assert made.name == "time_synthetic-room" and "PaD-GS" in {label.text for label in named[0]}
+    assert len(logged.points) > NAMED == len(named[0])
+    assert (200, pytest.approx(25.52, abs=0.01)) in [label.at for label in named[0]]  # 26.05 - 8 / 15 at the last probe
+    assert time_chart(one(runs)) is None, "no quality over time without a log"
+
+
+def test_each_method_has_one_name_over_time_at_its_best_setting_within_the_axis():
+    made = one([small(20 + n, 1.0, method=preset) for n, preset in enumerate(["padgs", "odgs", "spags", "omnigs"])])
+    ends = [
+        ("padgs", 20),
+        ("padgs", 21),
+        ("odgs", 25),
+        ("odgs", 24),
+        ("spags", 30),
+        ("spags", 99),
+        ("padgs_release", 28),
+    ]
+    curves = [(SimpleNamespace(preset=preset, title=f"{preset} {end}"), [1.0], [end]) for preset, end in ends]
+    named = trade_off_chart._named(made, curves, 10, 50)
+    assert [*named.items()] == [("padgs", "padgs 21"), ("spags", "spags 30"), ("odgs", "odgs 25")]
 
 
 def numbers(chart) -> dict[tuple[str, str], float]:

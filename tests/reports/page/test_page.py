@@ -77,14 +77,6 @@ def test_the_number_of_files_is_bounded(runs, monkeypatch):
     assert page.album(RunSet(runs)).left_out == ["synthetic-room (generated)"]
 
 
-def test_an_incomplete_file_is_left_out(tmp_path):
-    runs = frame(store.read(write(compared(["synthetic-room"], seeds=1)[:2], tmp_path, renders=True))[0])
-    broken = runs["renders"][0] / "view0.png"
-    broken.write_bytes(broken.read_bytes()[:300])
-    first, second = page.album(RunSet(runs)).scenes[0]["views"]
-    assert (len(first["methods"]), len(second["methods"])) == (1, 2)
-
-
 @pytest.mark.slow
 @in_chromium
 def test_in_a_browser(html, tmp_path):
