@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import Capture, DataError, Reading, Tracks, listed
+from padgs.data.capture import Capture, DataError, Reading, Tracks
 from padgs.data.images import decode
 from padgs.data.store import area_resize
 from padgs.geometry.panorama import project
@@ -102,7 +102,7 @@ def best_reading(capture: Capture) -> Capture:
         if max(fits) > max(MIN_CORRELATION, fits[0] + MIN_GAIN):
             best = readings[fits.index(max(fits))]
         why = f"colours agree by {max(fits):.2f}" if max(fits) > MIN_CORRELATION else "not tested by colours"
-        notes.append(f"{best.words} ({why}; otherwise {listed(one.words for one in readings if one is not best)})")
+        notes.append(f"{best.words}: {why}")
     frames = (
         replace(frame, cam_from_world=best.axes @ pose) for frame, pose in zip(capture.frames, poses, strict=True)
     )

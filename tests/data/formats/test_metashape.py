@@ -41,7 +41,7 @@ def test_golden_poses_come_back(shared: Path, tmp_path: Path) -> None:
 def test_the_frame_of_points_is_decided_by_their_colours(cloud: str, world: World, tmp_path: Path) -> None:
     write_metashape(world, tmp_path, cloud=cloud)
     scene = load(tmp_path)
-    assert any(f"points in the frame of the {cloud} (colours agree by 0.9" in note for note in scene.notes)
+    assert any(f"points in the frame of the {cloud}: colours agree by 0.9" in note for note in scene.notes)
     torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
 
 

@@ -19,7 +19,7 @@ from padgs.data.cloud import read_cloud
 def test_turned_images_of_navvis_are_recognised_by_colours(turn: float, along: str, world: World, tmp_path: Path):
     write_navvis(world, tmp_path, turn)
     scene = load(tmp_path)
-    assert any(f"centres of images along {along} of their poses (colours agree by 0.9" in note for note in scene.notes)
+    assert any(f"centres of images along {along} of their poses: colours agree by 0.9" in note for note in scene.notes)
     for view in scene.train:
         rotation = torch.from_numpy(world.rotations[world.names.index(view.name)])
         torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
