@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # Where nothing may be kept, every process compiles torch anew: four seconds of each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test test-all lint bench
+.PHONY: run test test-all lint docs bench
 
 run: .venv/installed ## padgs-run, with ARGS="..." for it
 	$(BIN)/padgs-run $(ARGS)
@@ -25,6 +25,9 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	ln -sfn ../baselines padgs/baselines && ln -sfn ../reports padgs/reports # pyright ignores import hooks
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: .venv/installed-dev ## the site, in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q
 
 bench: .venv/installed ## time of each stage against this machine's ceilings
 	$(BIN)/padgs bench $(ARGS)

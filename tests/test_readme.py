@@ -151,3 +151,10 @@ def test_extras_are_installed_without_compiling_again():
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         commands = re.findall(r"""pip install[^`\n]*-e ["']\.\[(?:view|video|mlflow|ray)\b""", page.read_text())
         assert not commands, page
+
+
+def test_links_between_pages_and_to_files_exist():
+    pages = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md"))
+    links = {(page, link) for page in pages for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())}
+    missing = [f"{page}: {link}" for page, link in links if "://" not in link and not (page.parent / link).exists()]
+    assert links and sorted(missing) == []
