@@ -85,10 +85,6 @@ class Decodable(Protocol):
         """Return the pixels without the cache."""
         ...
 
-    def file(self, folder: Path) -> tuple[Path, tuple[int, int, int]]:
-        """Return the file of the pixels in a cache on disk, and their shape."""
-        ...
-
 
 class ImageStore:
     """Least-recently-used cache of decoded images, bounded in bytes. Thread-safe."""
@@ -140,7 +136,8 @@ class ImageStore:
     def _fill(self, image: Decodable, future: Future[Tensor]) -> None:
         """Decode into the cache; an error is raised where the future's result is used."""
         try:
-            pixels = (image.decode() if self.folder is None else self._stored(image, self.folder)).to(self.device)
+            on_disk = self.folder if isinstance(image, StoredImage) else None
+            pixels = (image.decode() if on_disk is None else self._stored(image, on_disk)).to(self.device)
         except BaseException as error:
             with self._lock:
                 del self._pending[image]
@@ -156,7 +153,7 @@ class ImageStore:
                 self.bytes += pixels.nbytes
         future.set_result(pixels)
 
-    def _stored(self, image: Decodable, folder: Path) -> Tensor:
+    def _stored(self, image: StoredImage, folder: Path) -> Tensor:
         """Read the pixels of an image from disk, or decode and write them; a full disk loses only the file."""
         with suppress(OSError, ValueError):
             path, shape = image.file(folder)

@@ -88,7 +88,7 @@ def test_views_are_cached_in_the_store_of_the_panorama(tmp_path: Path, panorama:
     Image.fromarray(panorama.load_pixels().numpy()).save(tmp_path / "p.png")
     size = 3 * WIDTH * HEIGHT
     for limit, kept in ((10 * size, True), (size // 10, False)):
-        store = ImageStore(limit, threads=0)
+        store = ImageStore(limit, threads=0, folder=tmp_path)
         stored = replace(panorama, load_pixels=StoredImage(tmp_path / "p.png", WIDTH, HEIGHT, store))
         cut = perspective_views(stored, FACES, square_lens(panorama.camera, 1.0))
         pixels = [view.load_pixels() for view in cut]

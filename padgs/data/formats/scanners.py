@@ -130,9 +130,9 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
 def _named_images(opened: Any) -> Iterator[tuple[str, Any]]:
     """Yield the entries of images2D with their names, numbered where one occurs twice."""
     taken: set[str] = set()
-    images = opened.root["images2D"] if opened.root.isDefined("images2D") else None
-    for index in range(images.childCount() if images is not None else 0):
-        image = images[index]
+    entries = opened.root["images2D"] if opened.root.isDefined("images2D") else ()
+    for index in range(entries.childCount() if entries else 0):
+        image = entries[index]
         stated = image["name"].value() if image.isDefined("name") else ""
         name = "".join(c if c.isalnum() or c in " -_." else "_" for c in stated).strip(" .")[:100] or f"{index:05d}"
         name = f"{name}_{index:05d}" if name.casefold() in taken else name
