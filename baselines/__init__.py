@@ -1,4 +1,4 @@
-"""Registry of the compared methods, one file each; PaD-GS and padgs_plus are packages of `padgs.methods`.
+"""Registry of the compared methods; PaD-GS and padgs_plus are packages of `padgs.methods`.
 
 Other packages add methods by entry points, see docs/your_own_method.
 """
@@ -11,8 +11,8 @@ METHODS = {
     "odgs": "padgs.baselines.odgs:ODGSMethod",
     "op43dgs": "padgs.baselines.op43dgs:OP43DGSMethod",
     "spags": "padgs.baselines.spags:SPaGSMethod",
-    "cubemap_3dgs": "padgs.baselines.cubemap_3dgs:Cubemap3DGSMethod",
-    "crops_3dgs": "padgs.baselines.crops_3dgs:Crops3DGSMethod",
+    "cubemap_3dgs": "padgs.baselines.perspective_3dgs:Cubemap3DGSMethod",
+    "crops_3dgs": "padgs.baselines.perspective_3dgs:Crops3DGSMethod",
     "egonerf": "padgs.baselines.egonerf:EgoNeRFMethod",
     "sc_omnigs": "padgs.baselines.sc_omnigs:SCOmniGSMethod",
     "seam360gs": "padgs.baselines.seam360gs:Seam360GSMethod",

@@ -6,9 +6,8 @@ from dataclasses import fields, replace
 
 import torch
 
-from padgs.methods.egonerf.field import EgoNeRF
+from padgs.methods.egonerf.field import EgoNeRF, EgoNeRFOptions
 from padgs.methods.egonerf.model import EgoNeRFModel, RayTrainer
-from padgs.methods.egonerf.options import EgoNeRFOptions
 from padgs.render import RenderConfig
 from padgs.scene import Scene
 from padgs.training.loop import Stage

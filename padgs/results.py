@@ -24,9 +24,8 @@ STATUSES = {
     "nan": "a loss, gradient or parameter was not finite",
     "diverged": "the loss rose far above its best and stayed there, or test views are worse than one mean colour",
     "collapsed": "almost nothing was left to render",
-    "exploded": "Gaussians grew far beyond the scene, or in number beyond all pixels",
+    "exploded": "the number of Gaussians grew far beyond all pixels",
     "degenerate": "images may be fine, but the depth is wrong",
-    "silent": "the gradients of some parameters were always 0",
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }

@@ -200,7 +200,6 @@ class Search:
             hold_out=hold_out,
             max_seconds=None,
             monitor=False,  # in so few iterations, views that differ look like divergence
-            guard_scales=False,  # whose bounds are relative to the beginning of a run
         )
         return replace(
             config,

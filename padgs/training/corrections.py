@@ -1,28 +1,25 @@
 """Corrections that training learns for its views: poses, exposures, and the camera that all views share.
 
-Held-out views have no correction of pose and exposure.
-
-A pose correction is a quaternion and a translation in the camera's own frame, so it turns the camera about its own
-center wherever the world's origin lies: x' = R(q) (R x + t) + scale * s. Exposures are gains and offsets per channel
-(as in URF, Rematas et al. 2022, but diagonal). They are relative: log-gains and offsets have a mean of 0 over all
-views, so held-out views have the mean exposure.
+Held-out views have no correction of pose and exposure. A pose correction is a quaternion and a translation in the
+camera's own frame, so it turns the camera about its own center: x' = R(q) (R x + t) + scale * s. Exposures are gains
+and offsets per channel (as in URF, Rematas et al. 2022, but diagonal); their means over all views are 1 and 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
+from padgs.data.camera_paths import centers
 from padgs.gaussians import rotation_matrices
 from padgs.geometry.camera import Panorama
 from padgs.geometry.lens import AXES
 from padgs.scene import Scene, View
-from padgs.training.align import Similarity, align
 from padgs.training.lenses import ROUGHNESS_WEIGHT, CameraMap, DualLens
 from padgs.training.model import Model, TrainingRender
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
@@ -41,6 +38,59 @@ POSE_RATES = {
 }
 MAP, FISHEYES = "map", "fisheyes_"
 LENSES = (GIVEN, MAP, *(FISHEYES + axis for axis in AXES))
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """first_from_second: x_first = scale * rotation @ x_second + translation."""
+
+    scale: float
+    rotation: Tensor  # [3, 3]
+    translation: Tensor  # [3]
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Map points [..., 3] of the second world to the first."""
+        return self.scale * points @ self.rotation.mT + self.translation
+
+    def pose(self, cam_from_world: Tensor) -> Tensor:
+        """Map a pose [4, 4] of the second world to the first; float64."""
+        cam_from_world = cam_from_world.to(self.rotation)
+        pose = torch.eye(4, dtype=torch.float64, device=self.rotation.device)
+        pose[:3, :3] = cam_from_world[:3, :3] @ self.rotation.mT
+        pose[:3, 3] = self.scale * cam_from_world[:3, 3] - pose[:3, :3] @ self.translation
+        return pose
+
+    def inverse(self) -> Similarity:
+        """Return second_from_first."""
+        return Similarity(1 / self.scale, self.rotation.mT, -self.translation @ self.rotation / self.scale)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Residuals of the alignment per camera."""
+
+    distance: Tensor  # [F] between centres, units of the first world
+    degrees: Tensor  # [F] between orientations
+
+
+def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
+    """Return the similarity first_from_second and its residuals for poses cam_from_world [F, 4, 4] float64.
+
+    The rotation comes from the orientations, because centres on a nearly straight path do not determine the rotation
+    about it. Scale and translation are least squares on the centres.
+    """
+    rotations = first[:, :3, :3].mT @ second[:, :3, :3]  # first_from_second as each camera sees it
+    u, _, vh = torch.linalg.svd(rotations.sum(0))
+    flip = torch.ones_like(u[0])
+    flip[2] = torch.linalg.det(u @ vh)
+    rotation = u * flip @ vh
+    a, b = centers(first), centers(second)
+    spread = (b - b.mean(0)) @ rotation.mT
+    scale = (((a - a.mean(0)) * spread).sum() / spread.square().sum()).item()
+    similarity = Similarity(scale, rotation, a.mean(0) - scale * rotation @ b.mean(0))
+    chord = (rotations - rotation).flatten(1).norm(dim=1) / (2 * 2**0.5)  # exact for small angles too
+    degrees = torch.rad2deg(2 * torch.asin(chord.clamp(max=1)))
+    return similarity, Difference((similarity(b) - a).norm(dim=1), degrees)
 
 
 class PoseRefinement(nn.Module):

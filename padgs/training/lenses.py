@@ -80,10 +80,7 @@ class CameraMap(nn.Module):
         ]
 
     def undistorted(self, view: View, target: Target, weight: str) -> Target:
-        """Return a training image and its mask as an ideal camera would take them; differentiable.
-
-        `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`.
-        """
+        """Return a training image and its mask as an ideal camera would take them; `weight` is in `ROW_WEIGHTS`."""
         pixels = self._resized(self.source_pixels(), view.width, view.height)
         mask = view.mask(device=pixels.device)
         if mask is None:
@@ -166,9 +163,8 @@ class CameraMap(nn.Module):
 class DualLens(nn.Module):
     """Two fisheye lenses at centre +- (gap / 2) axis, along +- axis, stitched as if they had one centre.
 
-    The stitching causes parallax at the seam between the lenses. Here that camera is differentiable: two views with
-    their own centres and rays, blended per pixel. After the abstract of Seam360GS (arXiv 2508.20080); the formulas are
-    ours (docs/methods.md).
+    The stitching causes parallax at the seam. Two views with their own centres and rays are blended per pixel. After
+    the abstract of Seam360GS (arXiv 2508.20080); the formulas are ours (docs/methods.md).
 
     Attributes:
         gap: [] distance between the optical centres, scene units; positive: each lens is on its own side.

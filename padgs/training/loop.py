@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
@@ -12,7 +13,7 @@ from torch import Tensor
 from padgs.clock import Lap
 from padgs.scene import Scene
 from padgs.training.corrections import Corrections
-from padgs.training.health import EarlyStopping, Failure, Guard, Monitor, out_of_memory_as_failure
+from padgs.training.health import EarlyStopping, Failure, Monitor, out_of_memory_as_failure
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget, TrainOptions
@@ -57,7 +58,7 @@ class Trainer:
 
         Args:
             views_each: views per iteration; Adam steps on the sum of their losses.
-            coarse_share: share of the run in which views are smaller, see `padgs.training.targets.CoarseToFine`.
+            coarse_share: share of the run in which views are smaller, see `padgs.training.targets.Targets`.
             stage: entered with the name of each part of an iteration, for timing.
         """
         self.iteration = self.step = self.skipped = 0
@@ -72,7 +73,6 @@ class Trainer:
         self.corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self.corrections.groups(budget.iterations)]
         self._optimizer = Optimizer(groups, options.check_every, **self.ADAM)
-        self._guard = Guard(groups, scene, gradients=options.guard_gradients, scales=options.guard_scales)
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out, device = self._early_stopping.held_out, self._optimizer.device
         self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out)
@@ -97,7 +97,6 @@ class Trainer:
             if isinstance(loss, float):
                 self._monitor.loss(loss, iteration)
             self._monitor.counts(counts, iteration)
-            self._monitor.gradients(self._optimizer.silent, iteration)
             if step == budget.iterations:
                 self._optimizer.refuse_non_finite(self._optimizer.parameters(), iteration)
             self.iteration, self.step, before = iteration, step, self.spent
@@ -151,9 +150,6 @@ class Trainer:
                 self._monitor.render(rendered, target.image, iteration)
             with stage("backward"):
                 loss.backward()
-                self._guard.clean(rendered.mean_offsets)
-            if checked:
-                self._monitor.positional_gradient(rendered.mean_offsets.grad, iteration)
             with stage("observe"), torch.no_grad():
                 model.observe(rendered, step)
             drawn.append(len(rendered.gaussians))
@@ -162,19 +158,17 @@ class Trainer:
     def _update(self, iteration: int, step: int) -> tuple[str, ...]:
         """Step the optimizer and densify; return events. No graph of `_gradients` may be alive."""
         optimizer = self._optimizer
-        optimizer.check(iteration, step)
+        optimizer.check(iteration)
         length = self._budget.iterations
         # Skipped steps count as done, so that learning rates do not rise when a run is stopped.
         iterations = round(length * iteration / (step - self.skipped))
         pace = Pace.of(self._options.learning_rates, iterations, length)
         with self._stage("optimizer"):
             optimizer.step(step, pace)
-            self._guard.bound()
             self.corrections.center()
         with self._stage("adapt"), torch.no_grad():
             passed = range(self.step + 1, step + 1)  # each schedule step densifies once
             events = tuple(event for one in passed for event in self._model.adapt(one, optimizer.adam))
-        events += self._guard.report(iteration) if optimizer.is_checked(iteration) or step == length else ()
         return events + (self.corrections.summary() if step == length else ())
 
     def state(self) -> State:
@@ -184,7 +178,7 @@ class Trainer:
         tensors |= {f"{VIEWS}{name}": tensor for name, tensor in self.corrections.state_dict().items()}
         tensors |= self._optimizer.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
         values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
-        values |= {name: getattr(self, f"_{name}").state for name in ("guard", "monitor", "early_stopping")}
+        values |= {name: copy.deepcopy(getattr(self, f"_{name}").state) for name in ("monitor", "early_stopping")}
         return State({name: tensor.detach().clone() for name, tensor in tensors.items()}, values)
 
     def load_state(self, state: State) -> None:
@@ -196,5 +190,5 @@ class Trainer:
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         for name in self.PROGRESS:
             setattr(self, name, state.values[name])
-        for name in ("guard", "monitor", "early_stopping"):
-            getattr(self, f"_{name}").load(state.values[name])
+        for name in ("monitor", "early_stopping"):
+            getattr(self, f"_{name}").state = copy.deepcopy(state.values[name])

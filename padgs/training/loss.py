@@ -107,19 +107,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 def window_mean(images: Tensor) -> Tensor:
     """Return the mean of each pixel's neighbourhood under the Gaussian window, [B, H, W, C]; zeros outside."""
-    return _WindowMean.apply(images)
-
-
-class _WindowMean(torch.autograd.Function):
-    """Blur with the SSIM window; as window and zero padding are symmetric, the blur is its own derivative."""
-
-    @staticmethod
-    def forward(ctx, images: Tensor) -> Tensor:
-        return _blur(_blur(images, dim=1), dim=2)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        return window_mean(grad)
+    return _blur(_blur(images, dim=1), dim=2)
 
 
 def _blur(images: Tensor, dim: int) -> Tensor:

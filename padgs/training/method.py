@@ -19,8 +19,7 @@ from padgs.geometry.camera import Panorama, RayTable
 from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
-from padgs.training.align import Similarity
-from padgs.training.corrections import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, PoseRefinement
+from padgs.training.corrections import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, PoseRefinement, Similarity
 from padgs.training.health import is_out_of_memory, validation_folds
 from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer

@@ -26,9 +26,6 @@ def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Ada
 
     `keep` is [N] bool, or row numbers [M] in the wanted order; all parameters have N rows.
     """
-    count = _row_count(parameters)
-    if keep.dtype == torch.bool and len(keep) != count:
-        raise ValueError(f"keep has {len(keep)} entries but the parameters have {count} rows")
     for parameter in parameters.values():
         parameter.data = parameter.data[keep]
         parameter.grad = None
@@ -37,20 +34,7 @@ def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Ada
 
 
 def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam, new: Mapping[str, Tensor]) -> None:
-    """Append rows [M, ...] to every parameter [N, ...] of the same name; the Adam moments of new rows are 0.
-
-    Raises:
-        ValueError: a name is missing or unknown, or a shape does not fit; nothing is changed.
-    """
-    _row_count(parameters)
-    if new.keys() != parameters.keys():
-        raise ValueError(f"new rows are for {sorted(new)} but the parameters are {sorted(parameters)}")
-    if len({len(rows) for rows in new.values()}) > 1:
-        raise ValueError(f"new rows differ in number: { ({name: len(rows) for name, rows in new.items()}) }")
-    for name, parameter in parameters.items():
-        if new[name].shape[1:] != parameter.shape[1:]:
-            wanted = ["M", *parameter.shape[1:]]
-            raise ValueError(f"new rows of {name} have shape {list(new[name].shape)}; it must be {wanted}")
+    """Append rows [M, ...] to every parameter [N, ...] of the same name; the Adam moments of new rows are 0."""
     for name, parameter in parameters.items():
         rows = new[name].detach().to(parameter)
         parameter.data = torch.cat((parameter.data, rows))
@@ -86,13 +70,6 @@ def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collecti
         parameter.grad = None
 
 
-def _row_count(parameters: Mapping[str, nn.Parameter]) -> int:
-    counts = {name: len(parameter) for name, parameter in parameters.items()}
-    if len(set(counts.values())) != 1:
-        raise ValueError(f"parameters must share one number of rows, but have {counts}")
-    return next(iter(counts.values()))
-
-
 ADAM = "adam/"  # prefix of its tensors in a state
 
 
@@ -102,7 +79,6 @@ class Optimizer:
     Attributes:
         adam: the torch optimizer, whose rows densification edits.
         pace: of the learning rates in the last step; None before the first, and for published rates.
-        silent: names of groups whose gradients are exactly 0 although they should learn; None if they were not checked.
     """
 
     def __init__(self, groups: Sequence[ParameterGroup], check_every: int, **adam: Any) -> None:
@@ -110,7 +86,6 @@ class Optimizer:
         self._groups, self._check_every = groups, check_every
         self.pace: Pace | None = None
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
-        self.silent: tuple[str, ...] | None = None
         self.adam = torch.optim.Adam(parameters, fused=True, **adam)  # fused: 2 to 3 times faster on CPUs
 
     @property
@@ -138,14 +113,12 @@ class Optimizer:
         """Return whether all values are checked at an iteration."""
         return iteration % self._check_every == 0
 
-    def check(self, iteration: int, step: int) -> None:
-        """Check all parameters and gradients if that is due, after `backward`; the step decides which should learn."""
-        self.silent = None
+    def check(self, iteration: int) -> None:
+        """Check all parameters and gradients if that is due, after `backward`."""
         if self.is_checked(iteration):
             parameters = self.parameters()
             gradients = {f"gradient of {name}": parameter.grad for name, parameter in parameters.items()}
             self.refuse_non_finite({**parameters, **gradients}, iteration)
-            self.silent = tuple(group.name for group in self._groups if _is_silent(group, step))
 
     def read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
         """Return the loss as a number; on a GPU only every few iterations, because the host has to wait for it.
@@ -197,11 +170,3 @@ def first_non_finite(tensors: Mapping[str, Tensor | None]) -> str | None:
         index = (~torch.isfinite(tensor)).nonzero()[0].tolist()
         return f"{name}{index if index else ''} is {tensor[tuple(index)].item()}"
     return None
-
-
-def _is_silent(group: ParameterGroup, iteration: int) -> bool:
-    """Return whether all gradients of a group are 0 although its learning rate is not."""
-    learned = [parameter for parameter in group.parameters if parameter.numel()]
-    if not learned or group.learning_rate(iteration) == 0:
-        return False
-    return all(parameter.grad is None or not parameter.grad.any() for parameter in learned)

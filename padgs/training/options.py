@@ -81,8 +81,6 @@ class TrainOptions:
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
     monitor: bool = True  # end a failing run, see `padgs.training.health.Monitor`
-    guard_gradients: bool = False  # set non-finite gradients of single rows to 0; see `padgs.training.health.Guard`
-    guard_scales: bool = False  # keep scales within bounds; see `padgs.training.health.Guard`
     exposures: str = GIVEN  # learned: gain and offset of each training view; test views have the mean one
     # learned: a small correction of each training view; test views keep theirs. learned_fast: at rates of SC-OmniGS,
     # and test views follow the training views by a similarity.

@@ -23,8 +23,6 @@ class ParameterGroup:
     parameters: tuple[nn.Parameter, ...]
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
     paced: bool = True  # whether it follows `Pace`; learned cameras do not
-    is_of_rows: bool = False  # whether each row belongs to one Gaussian or anchor
-    unit: float = 1.0  # world units of log-scales
 
 
 @dataclass(frozen=True)
@@ -66,11 +64,10 @@ class LogLinear:
 class Pace:
     """Ratio of learning rates to the published ones: `factor`, which falls to 1 at the end of the run.
 
-    Adam moves a parameter by about its learning rate in a step, so parameters move less in a run with fewer steps.
-    Random steps cover distances that grow with the square root of their number; the factor that fits a run is the
-    square root of published over actual length, at most `FASTEST`. From `SLOWING_FROM` on it falls log-linearly to 1,
-    so that models settle as they do at published rates. At the published length it is 1. OmniGS wants less of it in
-    longer runs: `LINEAR_ITERATIONS` over the actual length (docs/methods.md).
+    Adam moves a parameter by about its learning rate in a step, and random steps cover distances that grow with the
+    square root of their number; so the factor is the square root of published over actual length, at most `FASTEST`.
+    From `SLOWING_FROM` on it falls log-linearly to 1. OmniGS wants less of it in longer runs: `LINEAR_ITERATIONS` over
+    the actual length (docs/methods.md).
 
     >>> Pace.of("run", 30_000).factor, Pace.of("run", 7500).factor, Pace.of("run", 60).factor
     (1.0, 2.0, 8.0)
@@ -104,9 +101,6 @@ class Pace:
 
 def scaled(published: int, total: int) -> int:
     """Return a published iteration number, scaled to a run of `total` iterations; at least 1.
-
-    Windows and intervals of densification scale like this, so that a short run goes through the same phases as the
-    published 30 000 iterations.
 
     >>> scaled(1500, 30_000), scaled(1500, 3_000), scaled(15_000, 30_000)
     (1500, 150, 15000)

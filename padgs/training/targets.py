@@ -31,29 +31,42 @@ class Target:
         return photometric_loss(image, self.image, self.weight, lambda_l1, normalisation=normalisation)
 
 
-class Targets(Sequence[Target]):
-    """The targets of views, by index; weights are cached within `CACHE_BYTES`."""
+class Targets:
+    """The training views with their targets, smaller at the beginning of a run; weights are cached.
 
-    def __init__(self, views: Sequence[View], weight: str, device: torch.device | str = "cpu") -> None:
+    From `coarse_share` of the run on, views have their own size; before that half of it, a quarter in the first half of
+    that time, and so on, as long as all views are panoramas of `MIN_WIDTH` or more.
+    """
+
+    def __init__(
+        self, views: Sequence[View], weight: str, device: torch.device | str = "cpu", coarse_share: float = 0.0
+    ) -> None:
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
-        self._views, self._weight, self._device = views, weight, device
-        self._weights: dict[int, Tensor] = {}
+        self._weight, self._device, self._coarse_share = weight, device, coarse_share
+        self._weights: dict[tuple[int, int], Tensor] = {}  # by the number of halvings and the index of the view
         self._bytes_left = CACHE_BYTES
+        self._levels = [views]
+        while views and all(view.lens is None and view.width >= 2 * MIN_WIDTH for view in views):
+            views = [halved(view) for view in views]
+            self._levels.append(views)
 
-    def __len__(self) -> int:
-        """Number of views."""
-        return len(self._views)
+    def halvings(self, progress: float) -> int:
+        """Return how often views are halved in a step that ends at a share of the run in (0, 1]."""
+        if progress >= self._coarse_share:
+            return 0
+        return min(math.ceil(math.log2(self._coarse_share / progress)), len(self._levels) - 1)
 
-    def __getitem__(self, index: int) -> Target:
-        """Return the target of view `index`; an unusable image or mask is a ValueError."""
-        image = image_of(self._views[index], self._device)
-        weight = self._weights.get(index)
+    def at(self, index: int, progress: float = 1.0) -> tuple[View, Target]:
+        """Return view `index` and its target in such a step; an unusable image or mask is a ValueError."""
+        level = self.halvings(progress)
+        view = self._levels[level][index]
+        image, weight = image_of(view, self._device), self._weights.get((level, index))
         if weight is None:
-            weight = weight_of(self._views[index], self._weight, self._device)
+            weight = weight_of(view, self._weight, self._device)
             if weight.nbytes <= self._bytes_left:
                 self._bytes_left -= weight.nbytes
-                self._weights[index] = weight
-        return Target(image, weight)
+                self._weights[level, index] = weight
+        return view, Target(image, weight)
 
 
 def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
@@ -85,31 +98,6 @@ def _checked_size(view: View, what: str, pixels: Tensor) -> Tensor:
     if (height, width) != (view.height, view.width):
         raise ValueError(f"{what} of view {view.name!r} is {width}x{height}; the view is {view.width}x{view.height}")
     return pixels
-
-
-class CoarseToFine:
-    """Views and their targets, smaller at the beginning of a run.
-
-    From `coarse_share` of the run on, views have their own size; before that half of it, a quarter in the first half of
-    that time, and so on, as long as all views are panoramas of `MIN_WIDTH` or more.
-    """
-
-    def __init__(self, views: Sequence[View], weight: str, device: torch.device, coarse_share: float) -> None:
-        """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
-        self._coarse_share, self._levels = coarse_share, [(views, Targets(views, weight, device))]
-        while views and all(view.lens is None and view.width >= 2 * MIN_WIDTH for view in views):
-            views = [halved(view) for view in views]
-            self._levels.append((views, Targets(views, weight, device)))
-
-    def halvings(self, progress: float) -> int:
-        """Return how often views are halved in a step that ends at a share of the run in (0, 1]."""
-        if progress >= self._coarse_share:
-            return 0
-        return min(math.ceil(math.log2(self._coarse_share / progress)), len(self._levels) - 1)
-
-    def at(self, progress: float) -> tuple[Sequence[View], Targets]:
-        """Return views and targets of such a step."""
-        return self._levels[self.halvings(progress)]
 
 
 def halved(view: View) -> View:
@@ -155,10 +143,10 @@ class TrainingViews:
         seed: int = 0,
         held_out: Collection[int] = (),
     ) -> None:
-        """Shuffle the views, except those `held_out` until `include_held_out`; targets are as in `CoarseToFine`."""
+        """Shuffle the views, except those `held_out` until `include_held_out`; `coarse_share` as in `Targets`."""
         self._scene, self._held_out = scene, tuple(held_out)
-        self._sizes = CoarseToFine(scene.train, weight, torch.device(device), coarse_share)
-        self.halvings = self._sizes.halvings
+        self._targets = Targets(scene.train, weight, device, coarse_share)
+        self.halvings = self._targets.halvings
         self._generator = torch.Generator().manual_seed(seed)
         self._order = self._shuffled()  # of this epoch
         self._position = 0
@@ -169,8 +157,7 @@ class TrainingViews:
         # At the end of an epoch the next order is unknown, and the present view is prefetched.
         upcoming = int(self._order[min(self._position, len(self._order) - 1)])
         self._scene.train[upcoming].prefetch()
-        views, targets = self._sizes.at(progress)
-        return index, views[index], targets[index]
+        return index, *self._targets.at(index, progress)
 
     def next_index(self) -> int:
         """Return the index of the next view."""

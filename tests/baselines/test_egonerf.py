@@ -8,9 +8,8 @@ from support.tiny_scene import in_other_units, squared_error, tiny_scene
 
 from padgs.baselines.egonerf import EgoNeRFMethod
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.methods.egonerf.field import EgoNeRF
+from padgs.methods.egonerf.field import EgoNeRF, EgoNeRFOptions
 from padgs.methods.egonerf.model import EgoNeRFModel
-from padgs.methods.egonerf.options import EgoNeRFOptions
 from padgs.render import RenderConfig
 from padgs.runs.run import build_method
 from padgs.scene import Scene, View
@@ -98,7 +97,6 @@ def test_row_weights_change_the_loss():
         ({"projection": "ray"}, {}, "renders no Gaussians, so render.projection=ray does not apply; leave it at erp"),
         ({"backend": "cpu"}, {}, "no backend 'cpu'; it casts rays in torch, known: auto, torch"),
         ({}, {"lambda_l1": 0.5}, "squared error .* so train.lambda_l1=0.5 does not apply; leave it at 0.8"),
-        ({}, {"guard_gradients": True}, "without Gaussians .* so train.guard_gradients=True does not apply"),
         ({}, {"normalisation": "channel_sum"}, "train.normalisation=channel_sum does not apply"),
     ],
 )
@@ -108,7 +106,7 @@ def test_options_of_splatting_are_refused(render, train, reason):
         next(EgoNeRFMethod(SMALL, RenderConfig(**render), train_options).fit(tiny_scene(), Budget(1)))
 
 
-@pytest.mark.parametrize("name, value", [("rays", 0), ("grid_rate", 0.0), ("density_variation", -1.0)])
+@pytest.mark.parametrize("name, value", [("rays", 0), ("density_variation", -1.0)])
 def test_invalid_training_options_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} is {value}"):
         method(**{name: value})
@@ -155,5 +153,4 @@ def test_published_weights_of_the_variation_fall_like_the_rates():
 
 def test_published_training_options():
     options = composed("method=egonerf").options
-    assert (options.rays, options.grid_rate, options.network_rate, options.environment_rate) == (4096, 0.02, 1e-3, 5e-3)
-    assert (options.rate_decay, options.density_variation, options.appearance_variation) == (0.1, 0.1, 0.01)
+    assert (options.rays, options.density_variation, options.appearance_variation) == (4096, 0.1, 0.01)

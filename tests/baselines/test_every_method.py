@@ -30,7 +30,6 @@ TINY_EGONERF = tuple(
     for name, value in {
         **{"radial_nodes": 16, "polar_nodes": 12, "azimuth_nodes": 36, "environment_height": 16, "hidden": 16},
         **{"density_components": 4, "appearance_components": 4, "coarse_samples": 16, "fine_samples": 16, "rays": 128},
-        "grid_rate": 0.1,  # twenty steps shall show something
     }.items()
 )
 # setting -> overrides that make it small enough for a test
@@ -47,6 +46,7 @@ def scenes(tmp_path_factory) -> Iterator[Callable[[str], Scene]]:
     """The synthetic scenes by their names, tiny."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr("padgs.methods.egonerf.model.GRID_RATE", 0.1)  # twenty steps shall show something
         yield cache(
             lambda name: generate(SyntheticOptions(name, WIDTH, train_views=3, test_views=1, samples=1, points=200))
         )

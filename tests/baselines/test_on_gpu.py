@@ -25,7 +25,7 @@ SPLATS = tuple(f"method.{name}={value}" for name, value in {"densify_every": 2, 
 ANCHORS = tuple(
     f"method.{name}={value}"
     for name, value in {
-        **{"scale_windows": "false", "statistics_from": 0, "grow_from": 1, "grow_until": 7, "grow_every": 2},
+        **{"statistics_from": 0, "grow_from": 1, "grow_until": 26_250, "grow_every": 2},
         **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]", "offset_rate_unit": "scene", "voxel_pixels": 3},
     }.items()
 )

@@ -11,8 +11,7 @@ from support.composed import composed
 from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
-from padgs.baselines.crops_3dgs import Crops3DGSMethod
-from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
+from padgs.baselines.perspective_3dgs import Crops3DGSMethod, Cubemap3DGSMethod
 from padgs.checks import lookup
 from padgs.data.perspectives import solid_angle
 from padgs.geometry.camera import Panorama

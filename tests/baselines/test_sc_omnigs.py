@@ -9,7 +9,7 @@ from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.evaluation.metrics import psnr
 from padgs.methods.splats.method import SplatOptions
 from padgs.render import RenderConfig
-from padgs.training.align import align
+from padgs.training.corrections import align
 from padgs.training.options import Budget, TrainOptions
 
 TORCH = RenderConfig(backend="torch")

@@ -10,7 +10,7 @@ from padgs.reports.frame import by_place, frame, images_seen
 from padgs.reports.published import Place
 from padgs.reports.store import Run
 from padgs.scene import View
-from padgs.training.targets import CoarseToFine
+from padgs.training.targets import Targets
 
 
 def test_a_row_a_run_with_its_numbers_conditions_and_keys():
@@ -80,7 +80,7 @@ def test_rays_count_as_pixels_and_all_else_as_whole_panoramas():
 @pytest.mark.parametrize("width", [512, 1024, 2000, 4096])
 def test_small_views_count_as_the_share_that_training_makes_them(width):
     view = View("a", torch.eye(4, dtype=torch.float64), width, width // 2)
-    sizes = CoarseToFine([view], "uniform", torch.device("cpu"), 0.3)
+    sizes = Targets([view], "uniform", "cpu", 0.3)
     seen = sum(0.25 ** sizes.halvings((i + 1) / 1000) for i in range(1000))
     own = {"method": "padgs_plus", "width": width, "height": width // 2, "iterations_done": 1000}
     options = {"method": {"coarse_share": 0.3}}

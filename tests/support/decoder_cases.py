@@ -29,7 +29,7 @@ def decoded(
 ) -> tuple[Gaussians, Tensor, Tensor, dict]:
     """Return Gaussians, slots, raw opacities, and the gradients of randomly weighted outputs."""
     leaves = {name: tensor.clone().requires_grad_(name in LEARNED) for name, tensor in tensors.items()}
-    gaussians, slots, raw = function(decoder.weights(), SeenAnchors(**leaves), precision)
+    gaussians, slots, raw, *_ = function(decoder.weights(), SeenAnchors(**leaves), precision)
     generator = torch.Generator().manual_seed(0)
     values = list(vars(gaussians).values())
     upstream = [torch.randn(value.shape, generator=generator).to(value) for value in values]

@@ -36,15 +36,11 @@ def losses(of):
     return lambda iteration: watch.loss(of(iteration), iteration)
 
 
-def drawing(image: torch.Tensor, *, transmittance: float = 0.2, scale: float = 0.1, large: int = 0) -> TrainingRender:
-    means = torch.randn(200, 3, generator=torch.Generator().manual_seed(1))
-    scales = torch.full((200, 3), 0.1)
-    scales[:large] = scale
-    gaussians = Gaussians(means, torch.ones(200, 4), scales, torch.ones(200), torch.ones(200, 3))
+def drawing(image: torch.Tensor, *, transmittance: float = 0.2) -> TrainingRender:
+    three, one = torch.ones(1, 3), torch.ones(1)
     flat = torch.full(image.shape[:2], transmittance)
-    return TrainingRender(
-        Rendering(image, flat, flat, torch.ones(200, dtype=torch.bool)), means, gaussians, torch.arange(200)
-    )
+    gaussians = Gaussians(three, torch.ones(1, 4), three, one, three)
+    return TrainingRender(Rendering(image, flat, flat, one > 0), three, gaussians, torch.arange(1))
 
 
 def test_a_loss_that_rises_and_stays_has_diverged():
@@ -123,36 +119,6 @@ def test_pictures_of_nothing_have_collapsed():
         assert said in str(failure) and "at iteration 150, and since 50" in str(failure)
 
 
-def test_single_large_gaussians_are_healthy_and_many_have_exploded():
-    photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
-    for large, healthy in ((2, True), (3, False)):
-        watch = monitor()
-        watch.render(drawing(photograph), photograph, 0)
-        made = drawing(photograph, large=large, scale=1e3)
-        if healthy:
-            for i in range(1, 20):
-                watch.render(made, photograph, 50 * i)
-        else:
-            failure, _ = ends(lambda i, made=made, watch=watch: watch.render(made, photograph, 50 * i), "exploded")
-            assert "scales[0] is 1e+03 world units at iteration 150; since 50 more than 1% of all" in str(failure)
-
-
-def test_parameters_without_a_gradient_are_silent_after_a_quarter_of_the_run():
-    watch = monitor()
-    failure, when = ends(lambda i: watch.gradients(("quats",) if i > 300 else (), i), "silent")
-    assert when == 551 and "the gradient of quats is exactly 0 at iteration 551, and since 301" in str(failure)
-    late = monitor()  # degrees of the spherical harmonics come one after the other
-    for iteration in range(0, ITERATIONS, 50):
-        late.gradients(("sh_rest",) if iteration <= 200 else (), iteration)
-
-
-@pytest.mark.parametrize("gradient", [None, torch.zeros(9, 3)])
-def test_growth_that_nothing_pulls_at_is_silent(gradient):
-    watch = monitor()
-    failure, when = ends(lambda i: watch.positional_gradient(gradient if i > 300 else torch.eye(3), i), "silent")
-    assert when == 301 + ITERATIONS // 4 and "since 301, so nothing can grow" in str(failure)
-
-
 def test_where_the_schedule_follows_the_clock_a_sign_lasts_for_a_share_of_it():
     watch = monitor()
     for iteration in range(1, 2000):  # 2000 steps are a tenth of the schedule
@@ -167,7 +133,7 @@ def test_what_it_remembers_is_json_and_goes_on():
     first, second = monitor(), monitor()
     for iteration in range(1, 150):
         first.loss(0.1 if iteration < 100 else 0.4, iteration)
-    second.load(json.loads(json.dumps(first.state)))
+    second.state = json.loads(json.dumps(first.state))
     assert (
         ends(lambda i: first.loss(0.4, 149 + i), "diverged")[1]
         == ends(lambda i: second.loss(0.4, 149 + i), "diverged")[1]
@@ -176,32 +142,16 @@ def test_what_it_remembers_is_json_and_goes_on():
 
 def test_a_resumed_run_is_compared_with_the_model_that_it_began_with():
     began, resumed = Monitor(ITERATIONS, count=5000, pixels=100), Monitor(ITERATIONS, count=10, pixels=100)
-    resumed.load(json.loads(json.dumps(began.state)))
+    resumed.state = json.loads(json.dumps(began.state))
     resumed.counts({"gaussians": 50_000}, 1)
     with pytest.raises(Failure, match="50001 gaussians at iteration 2, more than 10 times the 5000"):
         resumed.counts({"gaussians": 50_001}, 2)
 
 
-class Deaf(SplatMethod):
-    """A method whose rotations nothing pulls at."""
-
-    def build_model(self, scene, iterations):
-        """See `Method.build_model`."""
-        trainee = super().build_model(scene, iterations)
-        draw = trainee.draw
-
-        def without(view, probe=None):
-            made = draw(view, probe)
-            trainee.splats.quats.register_hook(torch.zeros_like)
-            return made
-
-        trainee.draw = without
-        return trainee
-
-
-def test_a_run_that_is_silent_stops_early_unless_it_is_not_to_be_watched():
+def test_a_failing_run_stops_early_unless_it_is_not_to_be_watched(monkeypatch):
+    monkeypatch.setattr("padgs.training.health.FAINTEST", 2.0)  # every render is too faint
     scene, budget = tiny_scene(), Budget(160)
-    with pytest.raises(Failure, match="gradient of quats is exactly 0 at iteration 150, and since 50") as caught:
-        list(Deaf(train=TrainOptions(check_every=50)).fit(scene, budget))
-    assert caught.value.status == "silent"
-    assert len(list(Deaf(train=TrainOptions(monitor=False)).fit(scene, budget))) == 160
+    with pytest.raises(Failure, match="at iteration 150, and since 50") as caught:
+        list(SplatMethod(train=TrainOptions(check_every=50)).fit(scene, budget))
+    assert caught.value.status == "collapsed"
+    assert len(list(SplatMethod(train=TrainOptions(monitor=False)).fit(scene, budget))) == 160

@@ -7,8 +7,7 @@ from support.tiny_scene import tiny_scene, truth
 
 from padgs.baselines.sc_omnigs import SCOmniGSMethod
 from padgs.render import RenderOptions, render
-from padgs.training.align import Similarity, align
-from padgs.training.corrections import PoseRefinement
+from padgs.training.corrections import PoseRefinement, Similarity, align
 from padgs.training.options import Budget
 
 VIEWS = tiny_scene().train

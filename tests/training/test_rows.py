@@ -1,4 +1,3 @@
-import pytest
 import torch
 from torch import Tensor, nn
 
@@ -70,16 +69,3 @@ def test_rows_can_change_before_the_first_step():
     append_rows({"a": parameter}, optimizer, {"a": torch.ones(1, 3)})
     keep_rows({"a": parameter}, optimizer, torch.tensor([2]))
     assert torch.equal(parameter, torch.ones(1, 3))
-
-
-def test_mistakes_are_named_and_change_nothing(generator):
-    parameters, optimizer, _ = trained(3, generator)
-    with pytest.raises(ValueError, match=r"new rows are for \['a'\] but the parameters are \['a', 'b'\]"):
-        append_rows(parameters, optimizer, {"a": torch.ones(2, 3)})
-    with pytest.raises(ValueError, match=r"new rows of b have shape \[2, 1\]; it must be \['M'\]"):
-        append_rows(parameters, optimizer, {"a": torch.ones(2, 3), "b": torch.ones(2, 1)})
-    with pytest.raises(ValueError, match="differ in number"):
-        append_rows(parameters, optimizer, {"a": torch.ones(2, 3), "b": torch.ones(1)})
-    with pytest.raises(ValueError, match="keep has 2 entries but the parameters have 3 rows"):
-        keep_rows(parameters, optimizer, torch.tensor([True, False]))
-    assert parameters["a"].shape == (3, 3) and parameters["b"].shape == (3,)

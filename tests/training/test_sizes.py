@@ -13,7 +13,7 @@ from padgs.scene import View
 from padgs.training import targets as training_targets
 from padgs.training.health import FIRST
 from padgs.training.options import Budget
-from padgs.training.targets import CoarseToFine, halved
+from padgs.training.targets import Targets, halved
 
 OPTIONS = PlusOptions()
 
@@ -25,8 +25,8 @@ def made(width: int, height: int) -> View:
     return View("a", torch.eye(4, dtype=torch.float64), width, height, lambda: pixels, lambda: mask)
 
 
-def sized(coarse_share: float, *views: View) -> CoarseToFine:
-    return CoarseToFine(views, "uniform", torch.device("cpu"), coarse_share)
+def sized(coarse_share: float, *views: View) -> Targets:
+    return Targets(views, "uniform", "cpu", coarse_share)
 
 
 def test_a_pixel_is_the_mean_of_the_four_that_it_covers():
@@ -63,20 +63,20 @@ def test_sizes_that_are_odd_leave_no_direction_out():
 def test_views_double_until_a_share_of_the_run(monkeypatch):
     monkeypatch.setattr(training_targets, "MIN_WIDTH", 8)
     found = sized(0.4, made(32, 16), made(32, 16))
-    widths = [found.at(progress)[0][1].width for progress in (0.01, 0.19, 0.2, 0.21, 0.39, 0.4, 1)]
+    widths = [found.at(1, progress)[0].width for progress in (0.01, 0.19, 0.2, 0.21, 0.39, 0.4, 1)]
     assert widths == [8, 8, 16, 16, 16, 32, 32]
     for progress in (0.01, 0.3, 1):
-        views, targets = found.at(progress)
-        assert targets[0].image.shape == (views[0].height, views[0].width, 3)
-    assert sized(0.0, made(32, 16)).at(1e-9)[0][0].width == 32
+        view, target = found.at(0, progress)
+        assert target.image.shape == (view.height, view.width, 3)
+    assert sized(0.0, made(32, 16)).at(0, 1e-9)[0].width == 32
     always = sized(1.0, made(32, 16))
-    assert [always.at(progress)[0][0].width for progress in (0.4, 0.9, 1.0)] == [8, 16, 32]
+    assert [always.at(0, progress)[0].width for progress in (0.4, 0.9, 1.0)] == [8, 16, 32]
 
 
 def test_small_panoramas_and_perspective_views_keep_their_size():
-    assert sized(0.4, made(512, 256)).at(0.01)[0][0].width == 512
+    assert sized(0.4, made(512, 256)).at(0, 0.01)[0].width == 512
     lens = Pinhole(1024, 512, 500.0, 500.0, 512.0, 256.0)
-    assert sized(0.4, replace(made(1024, 512), lens=lens)).at(0.01)[0][0].width == 1024
+    assert sized(0.4, replace(made(1024, 512), lens=lens)).at(0, 0.01)[0].width == 1024
 
 
 def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypatch):

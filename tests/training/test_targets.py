@@ -16,7 +16,7 @@ def view(pixels: torch.Tensor, mask: torch.Tensor | None = None) -> View:
 def test_image_and_weight():
     mask = torch.ones(4, 8)
     mask[3] = 0
-    target = Targets([view(PIXELS, mask)], "uniform")[0]
+    target = Targets([view(PIXELS, mask)], "uniform").at(0)[1]
     assert torch.equal(target.image, PIXELS / 255)
     assert torch.equal(target.weight, mask)
 
@@ -24,8 +24,8 @@ def test_image_and_weight():
 def test_weights_are_kept_only_while_there_is_room(monkeypatch):
     monkeypatch.setattr(padgs.training.targets, "CACHE_BYTES", 16)  # one weight
     targets = Targets([view(PIXELS), view(255 - PIXELS)], "uniform")
-    assert targets[0].weight is targets[0].weight
-    assert targets[1].weight is not targets[1].weight
+    assert targets.at(0)[1].weight is targets.at(0)[1].weight
+    assert targets.at(1)[1].weight is not targets.at(1)[1].weight
 
 
 @pytest.mark.parametrize(
@@ -38,4 +38,4 @@ def test_weights_are_kept_only_while_there_is_room(monkeypatch):
 )
 def test_unusable_pixels_are_named(pixels, mask, message):
     with pytest.raises(ValueError, match=message):
-        Targets([view(pixels, mask)], "solid_angle")[0]
+        Targets([view(pixels, mask)], "solid_angle").at(0)

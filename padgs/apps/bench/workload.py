@@ -16,7 +16,7 @@ from torch import Tensor
 
 from padgs.methods.anchors.anchors import PaDGS
 from padgs.methods.anchors.growth import GrowthOptions
-from padgs.methods.anchors.model import AnchorModel, LearningRates
+from padgs.methods.anchors.method import AnchorModel, LearningRates
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View
 from padgs.training.loop import Stage, Trainer

@@ -15,14 +15,14 @@ from padgs.data.capture import DataError
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
-from padgs.methods.anchors.model import AnchorModel
+from padgs.methods.anchors.method import AnchorModel
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
 from padgs.methods.splats.splats import Splats
 from padgs.render import Rendering, render
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
-from padgs.training.align import Similarity
+from padgs.training.corrections import Similarity
 
 DISTILLATION_STEPS = 300
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"

@@ -12,7 +12,7 @@ from torch import Tensor
 from padgs.evaluation.images import depth_image, error_image, to_uint8
 from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.geometry.panorama import sample
-from padgs.methods.anchors.model import AnchorModel
+from padgs.methods.anchors.method import AnchorModel
 from padgs.methods.splats.model import SplatModel
 from padgs.runs.load import LoadedRun
 from padgs.scene import View

@@ -16,13 +16,7 @@ from torch import Tensor, nn
 from padgs.checks import check, check_known
 from padgs.gaussians import Gaussians
 from padgs.geometry.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
-from padgs.methods.anchors.decoder import (
-    Decoder,
-    SeenAnchors,
-    decode_gaussians,
-    decode_with_capacity,
-    supports_capacity,
-)
+from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
 from padgs.methods.anchors.native_decoder import PRECISIONS
 from padgs.native.cuda import HostCopy
 from padgs.scene import Scene, View
@@ -93,7 +87,7 @@ class PaDGS(nn.Module):
         log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians; in `unit`.
         decoder: three networks.
         voxel_size: spacing of the grid that anchors live on, world units.
-        distance_scale: divisor of the distance input, world units.
+        scene_scale: `Scene.scale`, world units.
         unit: world units of the log-scales; a power of two, so that worlds that differ by one train alike, bit by bit.
     """
 
@@ -106,14 +100,14 @@ class PaDGS(nn.Module):
         options: PaDGSOptions = PaDGSOptions(),
         *,
         voxel_size: float,
-        distance_scale: float = 1.0,
+        scene_scale: float = 1.0,
         unit: float = 1.0,
         generator: torch.Generator | None = None,
     ) -> None:
         """Build an untrained model: Gaussians at their anchors [A, 3], log-scales [A, 6], random networks."""
         super().__init__()
         count = len(positions)
-        self.options, self.voxel_size, self.distance_scale, self.unit = options, voxel_size, distance_scale, unit
+        self.options, self.voxel_size, self.scene_scale, self.unit = options, voxel_size, scene_scale, unit
         self.register_buffer("positions", positions)
         self.features = nn.Parameter(positions.new_zeros(count, options.features))
         self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
@@ -134,7 +128,7 @@ class PaDGS(nn.Module):
             initial_log_scales(positions / unit, voxel_size / unit),
             options,
             voxel_size=voxel_size,
-            distance_scale=1.0 if in_world else scene.scale,
+            scene_scale=scene.scale,
             unit=unit,
             generator=torch.Generator().manual_seed(seed),
         )
@@ -159,32 +153,19 @@ class PaDGS(nn.Module):
 
     @torch.no_grad()
     def seen_from(self, view: View) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the anchors as seen from a camera, without gradient.
-
-        Returns:
-            direction [A, 3] camera -> anchor, world frame; distance [A] in `distance_scale`; distortion degree Omega
-            [A].
-        """
+        """Return direction [A, 3] camera -> anchor in the world, distance [A] in `distance_unit`, distortion [A]."""
         ray = self.positions - view.center.to(self.positions)
-        distance = torch.sqrt((ray * ray).sum(-1) + (TINY * self.distance_scale) ** 2)
+        unit = 1.0 if self.options.distance_unit == "world" else self.scene_scale
+        distance = torch.sqrt((ray * ray).sum(-1) + (TINY * unit) ** 2)
         direction = ray / distance[:, None]
         axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
-        return direction, distance / self.distance_scale, distortion(direction, axis)
+        return direction, distance / unit, distortion(direction, axis)
 
     def decode(self, view: View, capacity: int | None = None) -> Decoded:
-        """Decode the Gaussians that a view sees (Eq. 13-15).
-
-        Args:
-            view: the camera.
-            capacity: on a GPU, return so many rows without waiting for N. Rows beyond N are zeros, which are culled; if
-                the capacity is below N, the last Gaussians are missing. None, or on other devices: N rows.
-        """
-        weights, anchors, precision = self.decoder.weights(), self.seen_anchors(view), self.options.precision
-        if capacity is None or not supports_capacity(anchors, precision):
-            gaussians, slots, raw_opacities = decode_gaussians(weights, anchors, precision)
-            count = None
-        else:
-            gaussians, slots, raw_opacities, count = decode_with_capacity(weights, anchors, capacity, precision)
+        """Decode the Gaussians that a view sees (Eq. 13-15); `capacity` as in `decode_gaussians`."""
+        gaussians, slots, raw_opacities, count = decode_gaussians(
+            self.decoder.weights(), self.seen_anchors(view), self.options.precision, capacity
+        )
         if self.unit != 1:
             gaussians = replace(gaussians, means=self.unit * gaussians.means, scales=self.unit * gaussians.scales)
         return Decoded(gaussians, slots, raw_opacities, None if count is None else HostCopy(count))
@@ -205,10 +186,7 @@ class PaDGS(nn.Module):
 
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:
-    """Return the voxel size, world units, of so many pixels of the training panoramas (pi / H radians) at median depth.
-
-    Neither the units of the world nor the density of the cloud matter.
-    """
+    """Return the voxel size, world units: so many pixels of the training panoramas at median depth."""
     return pixels * math.pi / scene.train[0].height * scene.scale
 
 

@@ -24,9 +24,7 @@ from padgs.methods.anchors.native_decoder import (
     linear,
     reduced_dtype,
 )
-from padgs.native import LIBRARIES, cpu, cuda
-
-FILTER_BELOW = 0.9  # share of anchors with a positive opacity
+from padgs.native import LIBRARIES, cpu
 
 
 class Head(NamedTuple):
@@ -62,96 +60,33 @@ class SeenAnchors(NamedTuple):
     attenuation: Tensor  # [A] factor on opacities (Eq. 15)
 
 
-class Attributes(NamedTuple):
-    """Network outputs for the N selected of A K Gaussians, in the order of their slots."""
-
-    raw_opacities: Tensor  # [A, K] in (-1, 1), all of them; a Gaussian is selected where this is positive
-    slots: Tensor  # [N] int64 ascending, anchor K + k
-    opacities: Tensor  # [N] in (0, 1), before modulation
-    colors: Tensor  # [N, 3] in (0, 1)
-    shrinkage: Tensor  # [N, 3] in (0, 1), share of the anchor's scale
-    quats: Tensor  # [N, 4] wxyz, not normalised
-
-
-def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = None) -> Attributes:
-    """Decode anchors (Eq. 13): opacity by tanh, colour and shrinkage by sigmoid.
-
-    The opacity network comes first; the other two, nine tenths of the work, see only anchors with a positive opacity.
-    Other outputs are never used, so the result is exact. If most anchors have one, all are decoded, which is faster
-    than filtering.
-
-    `inputs` are [A, I]; `dtype` is that of the products, see `padgs.methods.anchors.native_decoder`.
-    """
-    raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
-    count, offsets = raw_opacities.shape
-    selected = raw_opacities.detach() > 0
-    alive = selected.any(-1).nonzero()[:, 0]  # [B]
-    slots = selected.view(-1).nonzero()[:, 0]
-    if len(alive) < FILTER_BELOW * count:
-        inputs = take_rows(inputs, alive)
-        decoded_slots = selected[alive].view(-1).nonzero()[:, 0]  # [N] rows among the B K decoded Gaussians
-    else:
-        decoded_slots = slots
-    colors = weights.color(inputs, dtype).view(-1, COLOR_VALUES)
-    covariances = weights.covariance(inputs, dtype).view(-1, COVARIANCE_VALUES)
-    shrinkage, quats = take_rows(covariances, decoded_slots).split((3, 4), dim=-1)
-    return Attributes(
-        raw_opacities,
-        slots,
-        take_rows(raw_opacities.view(-1, 1), slots)[:, 0],
-        torch.sigmoid(take_rows(colors, decoded_slots)),
-        torch.sigmoid(shrinkage),
-        quats,
-    )
-
-
 def decode_gaussians(
-    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
-) -> tuple[Gaussians, Tensor, Tensor]:
+    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32", capacity: int | None = None
+) -> tuple[Gaussians, Tensor, Tensor, Tensor | None]:
     """Return the selected Gaussians of all anchors (Eq. 13-15).
 
-    Differentiable by weights, features, offsets and log-scales. `precision` is a name of
-    `padgs.methods.anchors.native_decoder.PRECISIONS`; reduced ones are made for GPUs and slower on the CPU.
+    Differentiable by weights, features, offsets and log-scales.
+
+    Args:
+        weights, anchors: the networks and their inputs.
+        precision: a name of `PRECISIONS`; reduced ones are made for GPUs and slower on the CPU.
+        capacity: on a GPU with the library, a number of rows, so that the host need not wait for N: the selected
+            Gaussians up to it, then zeros, which are culled. Without effect elsewhere.
 
     Returns:
-        N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient.
+        N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient;
+        with a capacity N, [1] int64, else None.
     """
     library = _library_for(anchors, precision)
     if library is None:
-        return define_gaussians(weights, anchors, precision)
+        return *define_gaussians(weights, anchors, precision), None
     flat = tuple(tensor for head in weights for tensor in head)
-    if library is cuda:
-        *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision))
-    else:
+    if library is cpu:
         *values, slots, raw = decode_on_cpu(flat, *anchors)
-    return Gaussians(*values), slots, raw
-
-
-def supports_capacity(anchors: SeenAnchors, precision: str = "float32") -> bool:
-    """Return whether `decode_with_capacity` takes these tensors: float32 on a GPU with the library."""
-    return _library_for(anchors, precision) is cuda
-
-
-def decode_with_capacity(
-    weights: DecoderWeights, anchors: SeenAnchors, capacity: int, precision: str = "float32"
-) -> tuple[Gaussians, Tensor, Tensor, Tensor]:
-    """Return `decode_gaussians` in a fixed number of rows, so that the host need not wait for N.
-
-    `capacity` is the number of rows, at most A K: the selected Gaussians up to it, then zeros, which are culled.
-
-    Returns:
-        As `decode_gaussians`, with zeros at slots of Gaussians that are not selected; N, [1] int64.
-    """
-    features = anchors.features
-    if features.dtype != torch.float32 or features.device.type != cuda.device_type():
-        raise ValueError(
-            f"decoding with a capacity takes float32 on a GPU; got {features.dtype} on {features.device}. Convert "
-            "them, or use decode_gaussians"
-        )
-    flat = tuple(tensor for head in weights for tensor in head)
-    capacity = min(capacity, anchors.offsets[..., 0].numel())
+        return Gaussians(*values), slots, raw, None
+    capacity = None if capacity is None else min(capacity, anchors.offsets[..., 0].numel())
     *values, slots, raw, count = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision), capacity=capacity)
-    return Gaussians(*values), slots, raw, count
+    return Gaussians(*values), slots, raw, None if capacity is None else count
 
 
 def _library_for(anchors: SeenAnchors, precision: str) -> ModuleType | None:
@@ -167,17 +102,22 @@ def define_gaussians(
     weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """Compute `decode_gaussians` in torch, for any dtype, precision and device."""
-    attributes = decode(weights, torch.cat((anchors.features, anchors.seen), dim=-1), reduced_dtype(precision))
-    rows = attributes.slots // anchors.offsets.shape[1]
+    dtype, inputs = reduced_dtype(precision), torch.cat((anchors.features, anchors.seen), dim=-1)
+    raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
+    slots = (raw_opacities.detach() > 0).view(-1).nonzero()[:, 0]
+    rows = slots // anchors.offsets.shape[1]
+    colors = take_rows(weights.color(inputs, dtype).view(-1, COLOR_VALUES), slots)
+    covariances = weights.covariance(inputs, dtype).view(-1, COVARIANCE_VALUES)
+    shrinkage, quats = take_rows(covariances, slots).split((3, 4), dim=-1)
     reach, size = take_rows(torch.exp(anchors.log_scales), rows).split((3, 3), dim=-1)
     gaussians = Gaussians(
-        means=take_rows(anchors.positions, rows) + reach * take_rows(anchors.offsets.view(-1, 3), attributes.slots),
-        quats=attributes.quats,
-        scales=size * attributes.shrinkage,
-        opacities=attributes.opacities * anchors.attenuation[rows],
-        colors=attributes.colors,
+        means=take_rows(anchors.positions, rows) + reach * take_rows(anchors.offsets.view(-1, 3), slots),
+        quats=quats,
+        scales=size * torch.sigmoid(shrinkage),
+        opacities=take_rows(raw_opacities.view(-1, 1), slots)[:, 0] * anchors.attenuation[rows],
+        colors=torch.sigmoid(colors),
     )
-    return gaussians, attributes.slots, attributes.raw_opacities.detach()
+    return gaussians, slots, raw_opacities.detach()
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:

@@ -55,8 +55,7 @@ class GrowthOptions:
     def for_run(self, iterations: int) -> GrowthOptions:
         """Return the options for a run of another length: each window is the same share of the run as published.
 
-        The interval shrinks too, but not below `MIN_GROW_EVERY`, so short runs have fewer rounds (26 instead of 134 at
-        3 000 iterations).
+        The interval shrinks too, but not below `MIN_GROW_EVERY`, so short runs have fewer rounds.
         """
         return replace(
             self,
@@ -112,13 +111,7 @@ class Growth:
         self.statistics = self._empty(len(self.model))
 
     def observe(self, raw_opacities: Tensor, slots: Tensor, gradient: Tensor, visible: Tensor, iteration: int) -> None:
-        """Add one view to the statistics.
-
-        Args:
-            raw_opacities: [A, K] as decoded.
-            slots: [N] anchor K + k of each rendered Gaussian, distinct.
-            gradient, visible: [N, 2] positional gradient, [N] bool.
-        """
+        """Add one view: raw opacities [A, K], distinct slots [N], positional gradient [N, 2] and visible [N] bool."""
         if not self.options.statistics_from < iteration < self.options.grow_until:
             return
         statistics = self.statistics
@@ -196,9 +189,8 @@ def find_new_anchors(
     """Return cells without an anchor that hold a Gaussian with a large gradient.
 
     Levels go from coarse to fine with growing thresholds; at each a candidate is kept with probability
-    1 - 0.5^(level + 1). If the coarsest level finds none, finer ones are skipped.
-
-    `mean_gradient` [A K] is a mean over views, negative for Gaussians that may not be candidates.
+    1 - 0.5^(level + 1). If the coarsest level finds none, finer ones are skipped. `mean_gradient` [A K] is negative for
+    Gaussians that may not be candidates.
     """
     centers, offsets = model.centers(), model.options.offsets
     anchors = cells_from_points(model.positions, model.voxel_size)  # [A, 3] in voxels

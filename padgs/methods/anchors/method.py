@@ -6,27 +6,193 @@ Defaults are the paper as written; conf/method/padgs_release.yaml has the deviat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
-from padgs.methods.anchors.growth import GrowthOptions
-from padgs.methods.anchors.model import LENGTHS, AnchorModel, LearningRates
-from padgs.scene import Scene
+import torch
+from torch import Tensor
+
+from padgs.checks import check, check_known
+from padgs.methods.anchors.anchors import Decoded, PaDGS, PaDGSOptions
+from padgs.methods.anchors.growth import Growth, GrowthOptions
+from padgs.methods.splats.importance import importance_scores, most_important
+from padgs.render import Rendering, RenderOptions, render, resolve_backend
+from padgs.scene import Scene, View
 from padgs.training.corrections import FISHEYES
-from padgs.training.loop import Record, Stage
+from padgs.training.initial_points import ExtentOptions
 from padgs.training.method import Method
-from padgs.training.model import State
+from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.options import AUTO, Budget
-from padgs.training.schedule import PUBLISHED_ITERATIONS
+from padgs.training.schedule import PUBLISHED_ITERATIONS, Constant, LogLinear, ParameterGroup
+
+OFFSET_RATE_UNITS = ("scene", "world")
+LENGTHS = ("voxel_size", "scene_scale", "unit")  # attributes of the anchors in a state
+HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
+
+
+@dataclass(frozen=True)
+class LearningRates(ExtentOptions):
+    """Learning rates of Adam; pairs are start and end of a log-linear decay over the run."""
+
+    # Times the camera extent in `offset_rate_unit`. Released: 0.01 and 0.0001 per world unit, of which an indoor scene
+    # has about two in its `Scene.scale`.
+    offset_rate: tuple[float, float] = (0.02, 0.0002)
+    offset_rate_unit: str = "scene"  # scene: `Scene.scale`, independent of world units | world: as released
+    feature_rate: float = 0.0075  # of anchor features
+    log_scale_rate: float = 0.007  # of anchor scales
+    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # of the opacity network
+    color_rate: tuple[float, float] = (0.008, 5e-5)  # of the colour network
+    covariance_rate: tuple[float, float] = (0.004, 0.004)  # of the network of scales and rotations
+
+    def __post_init__(self) -> None:
+        check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)
+        pairs = ("offset_rate", "opacity_rate", "color_rate", "covariance_rate")
+        check(self, "two rates > 0", lambda pair: all(0 < rate < math.inf for rate in pair), *pairs)
+        check(self, ">= 0 and finite", lambda rate: 0 <= rate < math.inf, "feature_rate", "log_scale_rate")
+        super().__post_init__()
+
+    def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:
+        """Return parameter groups for a run of `iterations`; `extent` in `offset_rate_unit`."""
+        first, last = self.offset_rate
+        groups = [
+            ParameterGroup(name, (getattr(model, name),), rate)
+            for name, rate in (
+                ("offsets", LogLinear(extent * first, extent * last, iterations)),
+                ("features", Constant(self.feature_rate)),
+                ("log_scales", Constant(self.log_scale_rate)),
+            )
+        ]
+        for head in ("opacity", "color", "covariance"):
+            weights = tuple(getattr(model.decoder, head).values())
+            first, last = getattr(self, f"{head}_rate")
+            groups.append(ParameterGroup(head, weights, LogLinear(first, last, iterations)))
+        return groups
+
+
+@dataclass(frozen=True)
+class AnchorRender(TrainingRender):
+    """Training render with the raw opacities of all anchors, which pruning needs.
+
+    The mean offsets may have more rows than there are Gaussians; the first N belong to them.
+    """
+
+    raw_opacities: Tensor  # [A, K]
+
+
+class AnchorModel:
+    """A PaD-GS model (`anchors`) with its `growth`; a `padgs.training.model.Model`."""
+
+    def __init__(
+        self,
+        anchors: PaDGS,
+        options: RenderOptions,
+        backend: str = "auto",
+        *,
+        growth: GrowthOptions = GrowthOptions(),  # noqa: B008 - frozen
+        rates: LearningRates = LearningRates(),
+        extent: float,
+        iterations: int,
+        seed: int = 0,
+    ) -> None:
+        """Wrap anchors for a run of `iterations`, with its `growth`, and `extent` in `rates.offset_rate_unit`."""
+        self.anchors, self.growth = anchors, Growth(anchors, growth, seed=seed)
+        self._options, self._backend = options, backend
+        self._rates, self._extent, self._iterations = rates, extent, iterations
+        self._capacity = 0  # of the next view, in Gaussians; 0: unknown
+
+    def groups(self) -> list[ParameterGroup]:
+        """Return all learnable parameters; positions of anchors are not learned."""
+        return self._rates.groups(self.anchors, self._extent, self._iterations)
+
+    def draw(self, view: View) -> AnchorRender:
+        """Decode the anchors for the view and render them, differentiably.
+
+        On backend cuda the capacity of the last view spares waiting for the number of Gaussians, which is read while
+        they are rendered. If the capacity was too small, everything is repeated.
+        """
+        ahead = resolve_backend(self._backend, self.anchors.positions) == "cuda"
+        decoded = self.anchors.decode(view, (self._capacity if ahead else 0) or None)
+        rendering, offsets = self._rendered(decoded, view)
+        if decoded.count() > len(decoded.slots):
+            decoded = self.anchors.decode(view)
+            rendering, offsets = self._rendered(decoded, view)
+        count = decoded.count()
+        self._capacity = max(int(HEADROOM * count) + 1, self._capacity * 15 // 16)
+        drawn = replace(rendering, visible=rendering.visible[:count])
+        return AnchorRender(
+            drawn, offsets, decoded.gaussians.first(count), decoded.slots[:count], decoded.raw_opacities
+        )
+
+    def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:
+        offsets = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
+        return render(decoded.gaussians, view, self._options, mean_offsets=offsets, backend=self._backend), offsets
+
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
+        """Collect opacities and positional gradients."""
+        assert isinstance(drawing, AnchorRender), type(drawing)
+        offsets = drawing.mean_offsets
+        gradient = torch.zeros_like(offsets) if offsets.grad is None else offsets.grad
+        gradient = gradient[: len(drawing.slots)]
+        self.growth.observe(drawing.raw_opacities, drawing.slots, gradient, drawing.rendering.visible, iteration)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Grow and prune anchors."""
+        return self.growth.adapt(iteration, optimizer)
+
+    def parts(self, view: View) -> Parts:
+        """Return the Gaussians decoded for the view; an anchor with its Gaussians is a row."""
+        decoded = self.anchors.decode(view)
+        return Parts(decoded.gaussians, decoded.slots, self.anchors.options.offsets, self._options)
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep these anchors only."""
+        self.growth.keep(rows, None)
+
+    def prune(self, count: int, views: Sequence[View]) -> None:
+        """Keep the `count` anchors that are most important to the views."""
+        self.keep(most_important(importance_scores(self, views), count))
+
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return render(self.anchors.decode(view).gaussians, view, self._options, backend=self._backend)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of anchors."""
+        return {"anchors": len(self.anchors)}
+
+    def size(self) -> Size:
+        """Return the numbers of anchors and Gaussians, and the bytes of the stored model."""
+        anchors = self.anchors
+        counts = {"anchors": len(anchors), "gaussians": len(anchors) * anchors.options.offsets}
+        return Size.of(counts, anchors.parameters(), stored=anchors.state_dict().values())
+
+    def state(self) -> State:
+        """Return parameters, growth statistics and random state; not copies."""
+        growth = {f"growth/{name}": values for name, values in self.growth.statistics.items()}
+        values = {name: getattr(self.anchors, name) for name in LENGTHS}
+        return State(
+            {**self.anchors.state_dict(), **growth, "random/growth": self.growth.generator.get_state()}, values
+        )
+
+    def load_state(self, state: State) -> None:
+        """Restore the model that `state` was taken of, whatever its number of anchors."""
+        self.load_model(state)
+        for name in self.growth.statistics:
+            self.growth.statistics[name] = state.tensors[f"growth/{name}"].to(self.anchors.positions.device, copy=True)
+        self.growth.generator.set_state(state.tensors["random/growth"].cpu())
+
+    def load_model(self, state: State) -> None:
+        """Load anchors and networks only; growth starts anew."""
+        self.anchors.load(state.tensors)
+        for name in LENGTHS:
+            setattr(self.anchors, name, state.values[name])
+        self.growth.reset_statistics()
 
 
 @dataclass(frozen=True)
 class PaDGSMethodOptions(PaDGSOptions, GrowthOptions, LearningRates):
     """The `method` group of the configuration: the model, its growth and its learning rates."""
-
-    scale_windows: bool = True  # windows of growth scale with the length of the run; false: absolute iterations
 
     def __post_init__(self) -> None:
         for part in (PaDGSOptions, GrowthOptions, LearningRates):
@@ -37,24 +203,6 @@ class PaDGSMethod(Method):
     """See `padgs.training.method.Method`."""
 
     Options = PaDGSMethodOptions
-    _scene_scale = math.nan  # of the scene of `fit`, or of the loaded state
-
-    def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
-        """Train; see `Method.fit`."""
-        self._scene_scale = scene.scale if scene.train else math.nan
-        return super().fit(scene, budget, stage=stage)
-
-    def state(self) -> State:
-        """See `Method.state`; rendering a loaded model needs the scene scale, too."""
-        state = super().state()
-        if "scene_scale" in state.values:  # of a loaded model
-            return state
-        return State(state.tensors, {**state.values, "scene_scale": self._scene_scale})
-
-    def load_state(self, state: State) -> None:
-        """See `Method.load_state`."""
-        self._scene_scale = state.values["scene_scale"]
-        super().load_state(state)
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()
@@ -91,12 +239,12 @@ class PaDGSMethod(Method):
         return self._model_of(PaDGS(positions, log_scales, self.options, **lengths), math.nan, PUBLISHED_ITERATIONS)
 
     def _model_of(self, anchors: PaDGS, extent: float, iterations: int) -> AnchorModel:
-        growth = self.options.for_run(iterations) if self.options.scale_windows else self.options
+        growth = self.options.for_run(iterations)
         if isinstance(self._gaussians, int):
             growth = replace(growth, max_anchors=min(self._gaussians, growth.max_anchors or self._gaussians))
         return AnchorModel(
             anchors,
-            self.render_config.options(self._scene_scale),
+            self.render_config.options(anchors.scene_scale),
             self.render_config.backend,
             growth=growth,
             rates=self.options,

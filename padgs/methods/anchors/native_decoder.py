@@ -1,10 +1,8 @@
 """Native decoding of anchors into Gaussians, with derivatives; `padgs.methods.anchors.decoder` is the definition.
 
-CPU: one call each way (csrc/cpu/decode.cpp). GPU, float32: matrix products by torch, the rest by csrc/cuda/decode.cu.
-The hidden layers of the three networks are one product with the ReLU in it, whose values are kept for the backward
-pass (4 bytes for each of the 96 units of an anchor, 2 in a reduced precision). GPU, reduced precision: products on
-tensor cores inside the kernels that use them (csrc/cuda/networks.cu, networks_backward.cu), which compute hidden units
-again in the backward pass and sum gradients of features and weights in float32 without rounding the result.
+CPU: one call each way (csrc/cpu/decode.cpp). GPU, float32: matrix products by torch, one for the hidden layers of the
+three networks, the rest by csrc/cuda/decode.cu. GPU, reduced precision: products on tensor cores inside the kernels
+that use them (csrc/cuda/networks*.cu), which compute hidden units again in the backward pass.
 """
 
 from __future__ import annotations

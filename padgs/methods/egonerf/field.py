@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from padgs.checks import check, check_known
 from padgs.methods.egonerf.grids import (
     CHARTS,
     MODES,
@@ -21,15 +23,119 @@ from padgs.methods.egonerf.grids import (
     density_feature,
     exponential_nodes,
     grid_position,
+    interval_lengths,
+    jittered,
     products,
+    refined,
+    visible_shares,
 )
-from padgs.methods.egonerf.options import EgoNeRFOptions
-from padgs.methods.egonerf.rays import interval_lengths, jittered, refined, visible_shares
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 
 CLOUD_SHARE = 0.95  # of the points; those behind may be outliers
 MAX_ROOM_REACH = 4.0  # scene units
+FREQUENCIES = 2  # of the positional encoding of features and directions
+
+
+class Constants(NamedTuple):
+    """Constants whose published values differ between indoor and outdoor scenes."""
+
+    density_shift: float  # density = softplus(feature + shift)
+    distance_scale: float  # optical depth = density x scale x length
+    near: float
+    far: float
+    first_radius: float  # of the radial nodes, and the shortest interval between nodes or coarse samples
+    environment: bool  # environment map as background; else black
+
+    def in_units_of(self, unit: float) -> Constants:
+        """Return the constants with lengths in units of `unit`."""
+        near, far, first_radius = self.near / unit, self.far / unit, self.first_radius / unit
+        return self._replace(distance_scale=self.distance_scale * unit, near=near, far=far, first_radius=first_radius)
+
+
+# World units of Ricoh360 and of the rooms of OmniBlender; ours: the scene scale of such scenes.
+PUBLISHED = {
+    "outdoor": (Constants(-10.0, 25.0, 0.1, 300.0, 0.05, True), 5.0),
+    "indoor": (Constants(-8.0, 25.0, 0.01, 15.0, 0.03, False), 2.5),
+}
+
+
+@dataclass(frozen=True)
+class EgoNeRFOptions:
+    """The model, and its training as published for Ricoh360.
+
+    Lengths are in scene scales, ours; None: the published value for the surroundings.
+    """
+
+    radial_nodes: int = 150  # of each chart
+    polar_nodes: int = 172  # of each chart
+    azimuth_nodes: int = 516  # of each chart
+    density_components: int = 16  # of each mode
+    appearance_components: int = 48  # of each mode
+    features: int = 27  # appearance features of the basis
+    hidden: int = 128  # width of the two hidden layers
+    coarse_samples: int = 128  # of each ray
+    fine_samples: int = 128  # importance samples of each ray
+    min_weight: float = 0.0  # ours: samples with smaller weights are not shaded but black
+    surroundings: str = "auto"  # indoor | outdoor | auto: by the cloud, see `surroundings_of`
+    density_shift: float | None = None  # density = softplus(feature + shift)
+    distance_scale: float | None = None  # optical depth = density x scale x length
+    near: float | None = None  # distance of the first sample
+    far: float | None = None  # distance of the last sample
+    first_radius: float | None = None  # of the radial nodes, and the shortest interval between nodes or samples
+    environment: bool | None = None  # environment map as background; else black
+    environment_height: int = 1920  # rows of the environment map; twice as many columns
+    samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
+    rays: int = 4096  # of an iteration
+    density_variation: float = 0.1  # weight of the total variation of the density planes; 0: none
+    appearance_variation: float = 0.01  # weight of the total variation of the appearance planes
+
+    def __post_init__(self) -> None:
+        check_known(self, surroundings=("auto", *PUBLISHED))
+        nodes = ("radial_nodes", "polar_nodes", "azimuth_nodes")
+        check(self, "even, for the coarse grid halves it, and at least 4", lambda n: n >= 4 and n % 2 == 0, *nodes)
+        sizes = ("density_components", "appearance_components", "features", "hidden", "environment_height", "rays")
+        check(self, "at least 1", lambda size: size >= 1, *sizes)
+        if self.coarse_samples < 4 or self.fine_samples < 1:
+            raise ValueError(
+                f"coarse_samples is {self.coarse_samples} and fine_samples {self.fine_samples}; "
+                "they must be at least 4 and 1"
+            )
+        check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
+        for surroundings in PUBLISHED if self.surroundings == "auto" else (self.surroundings,):
+            _check_constants(self.constants(surroundings))
+        check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
+        if self.samples_at_once < self.samples:
+            raise ValueError(
+                f"samples_at_once is {self.samples_at_once}, less than the {self.samples} of a single ray; raise it"
+            )
+
+    def constants(self, surroundings: str) -> Constants:
+        """Return the constants for indoor or outdoor; given values replace published ones."""
+        published, unit = PUBLISHED[surroundings]
+        published = published.in_units_of(unit)
+        given = {name: getattr(self, name) for name in Constants._fields}
+        return published._replace(**{name: value for name, value in given.items() if value is not None})
+
+    @property
+    def samples(self) -> int:
+        """Shaded samples of a ray."""
+        return self.coarse_samples + self.fine_samples
+
+    @property
+    def rays_at_once(self) -> int:
+        """Rays in one pass."""
+        return self.samples_at_once // self.samples
+
+
+def _check_constants(constants: Constants) -> None:
+    near, far, first_radius = constants.near, constants.far, constants.first_radius
+    if not 0 < first_radius < far - near or not near > 0:
+        raise ValueError(
+            f"near is {near}, far {far} and first_radius {first_radius}; near and first_radius must be > 0, and "
+            "far - near larger than first_radius"
+        )
+    check(constants, "> 0", lambda scale: scale > 0, "distance_scale")
 
 
 class RayColors(NamedTuple):
@@ -74,7 +180,7 @@ class EgoNeRF(nn.Module):
     @classmethod
     def from_scene(cls, scene: Scene, options: EgoNeRFOptions, seed: int = 0) -> EgoNeRF:
         """Return an untrained model around the mean training camera, on the device of the scene's points."""
-        unit = scene.scale if options.length_unit == "scene" else 1.0
+        unit = scene.scale
         centers = torch.stack([view.center for view in scene.train]).double().cpu()
         centre = centers.mean(0)
         travel = (centers - centre).norm(dim=-1).max().item() / unit
@@ -160,11 +266,11 @@ class Shader(nn.Module):
 
     def __init__(self, options: EgoNeRFOptions) -> None:
         super().__init__()
-        self.options, features, hidden = options, options.features, options.hidden
+        features, hidden = options.features, options.hidden
         inputs = len(MODES) * options.appearance_components
         bound = 1 / math.sqrt(inputs)
         self.basis = nn.Parameter(torch.empty(CHARTS, features, inputs).uniform_(-bound, bound))
-        width = features * (1 + 2 * options.feature_frequencies) + 3 * (1 + 2 * options.direction_frequencies)
+        width = (features + 3) * (1 + 2 * FREQUENCIES)
         last = nn.Linear(hidden, 3)
         nn.init.zeros_(last.bias)
         self.network = nn.Sequential(
@@ -175,8 +281,8 @@ class Shader(nn.Module):
         """Return colours [N, 3] from `grids.products`, charts [N] of the positions, and unit directions [N, 3]."""
         stacked = torch.cat(list(products))
         features = torch.where(chart == YANG, self.basis[YANG] @ stacked, self.basis[YIN] @ stacked).T
-        seen = encoding(directions, self.options.direction_frequencies)
-        return self.network(torch.cat((encoding(features, self.options.feature_frequencies), seen), dim=-1))
+        encoded = encoding(features, FREQUENCIES), encoding(directions, FREQUENCIES)
+        return self.network(torch.cat(encoded, dim=-1))
 
 
 def encoding(values: Tensor, frequencies: int) -> Tensor:

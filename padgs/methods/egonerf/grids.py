@@ -1,4 +1,4 @@
-"""EgoNeRF's grids: two charts of the sphere, exponential radial nodes, and planes times lines on them.
+"""EgoNeRF's grids and samples: two charts of the sphere, exponential nodes, planes times lines; samples along rays.
 
 Yin and yang are two charts without poles, 90 degrees of latitude by 270 degrees of longitude each. Yin holds the
 directions with polar angle acos(z / r) in [pi/4, 3 pi/4] and azimuth atan2(y, x) in [-3 pi/4, 3 pi/4]; yang holds all
@@ -23,6 +23,7 @@ YIN, YANG = 0, 1
 CHARTS = 2
 # Each mode is a plane over two axes and a line over the third; the first axis of a plane carries the charts.
 MODES = ((("polar", "radius"), "azimuth"), (("azimuth", "radius"), "polar"), (("polar", "azimuth"), "radius"))
+MIN_WEIGHT = 1e-5  # added to every weight of a coarse sample, so that empty rays are still sampled everywhere
 THREADS = 4  # grid_sample is parallel over its batch only, so channels are split into so many batch entries
 
 
@@ -51,15 +52,6 @@ def locate(points: Tensor) -> ChartPosition:
         ((polar - math.pi / 2) / POLAR_SPAN + 0.5).clamp(0, 1),
         (azimuth / AZIMUTH_SPAN + 0.5).clamp(0, 1),
     )
-
-
-def direction(position: ChartPosition) -> Tensor:
-    """Return unit directions [..., 3] of places; the inverse of `locate`."""
-    polar = (position.polar - 0.5) * POLAR_SPAN + math.pi / 2
-    azimuth = (position.azimuth - 0.5) * AZIMUTH_SPAN
-    sin_polar = torch.sin(polar)
-    unit = torch.stack((sin_polar * torch.cos(azimuth), sin_polar * torch.sin(azimuth), torch.cos(polar)), dim=-1)
-    return torch.where((position.chart == YIN)[..., None], unit, swapped(unit))
 
 
 def swapped(points: Tensor) -> Tensor:
@@ -187,3 +179,69 @@ def _look_up(image: Tensor, chart: Tensor, first: Tensor, second: Tensor | None)
         padding_mode="border",
     )
     return values.reshape(components, -1)
+
+
+def jittered(distances: Tensor, random: Tensor) -> Tensor:
+    """Return distances [..., S], each moved by a share `random` [..., S] in [0, 1) of the interval behind it."""
+    return distances + interval_lengths(distances) * random
+
+
+def interval_lengths(distances: Tensor) -> Tensor:
+    """Return the length [..., S] of the interval behind each distance [..., S]; the last repeats the one before.
+
+    >>> interval_lengths(torch.tensor([1.0, 2.0, 5.0])).tolist()
+    [1.0, 3.0, 3.0]
+    """
+    lengths = distances.diff(dim=-1)
+    return torch.cat((lengths, lengths[..., -1:]), dim=-1)
+
+
+def refined(distances: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
+    """Return distances of fine samples [B, F]: quantiles of the weights of the coarse samples.
+
+    Args:
+        distances: [B, S] increasing.
+        weights: [B, S] >= 0; weight k lies between the midpoints around distance k, the outer two are ignored.
+        shares: [B, F] in [0, 1], of the total weight.
+    """
+    midpoints = (distances[:, 1:] + distances[:, :-1]) / 2
+    return inverse_cdf(midpoints, weights[:, 1:-1] + MIN_WEIGHT, shares)
+
+
+def inverse_cdf(edges: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
+    """Return quantiles [B, F] of a piecewise constant density.
+
+    Args:
+        edges: [B, M + 1] increasing, of the pieces.
+        weights: [B, M] > 0, mass of each piece up to a factor.
+        shares: [B, F] in [0, 1], of the mass below each quantile.
+
+    >>> inverse_cdf(torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([[1.0, 3.0]]), torch.tensor([[0.25, 0.625]])).tolist()
+    [[1.0, 1.5]]
+    """
+    cumulative = torch.cat((torch.zeros_like(weights[:, :1]), weights.cumsum(-1)), dim=-1)
+    mass = (shares * cumulative[:, -1:]).contiguous()
+    piece = torch.searchsorted(cumulative, mass, right=True).clamp(1, weights.shape[1]) - 1
+    below, weight = cumulative.gather(1, piece), weights.gather(1, piece)
+    low, high = edges.gather(1, piece), edges.gather(1, piece + 1)
+    return low + (high - low) * ((mass - below) / weight).clamp(0, 1)
+
+
+def visible_shares(optical_depths: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weight of each interval of a ray, and the transmittance behind all; together 1.
+
+    weight_k = exp(-sum of the depths in front) (1 - exp(-depth_k)), exact for intervals of constant density.
+
+    Args:
+        optical_depths: [..., S] >= 0, density times length of the intervals, from front to back.
+
+    Returns:
+        weights [..., S], residual [...].
+
+    >>> weights, residual = visible_shares(torch.tensor([0.6931472, 0.6931472]))
+    >>> weights.tolist(), residual.item()
+    ([0.5, 0.25], 0.25)
+    """
+    behind = torch.exp(-optical_depths.cumsum(-1))
+    front = torch.cat((torch.ones_like(behind[..., :1]), behind[..., :-1]), dim=-1)
+    return front * -torch.expm1(-optical_depths), behind[..., -1]

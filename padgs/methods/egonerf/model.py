@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Camera
 from padgs.methods.egonerf.field import EgoNeRF
-from padgs.methods.egonerf.rays import RayPixels
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 from padgs.training.loop import Stage, Trainer
 from padgs.training.model import Model, Size, State
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import LogLinear, ParameterGroup
+from padgs.training.targets import image_of, weight_of
 
+GRID_RATE, NETWORK_RATE, ENVIRONMENT_RATE = 0.02, 1e-3, 5e-3  # learning rates of Adam at the start
+RATE_DECAY = 0.1  # rates and weights of the total variation decay exponentially to this share
 VARIATION_FACTOR = 1e-2  # published, on both weights of the total variation
 
 
@@ -34,14 +39,14 @@ class EgoNeRFModel:
 
     def groups(self) -> list[ParameterGroup]:
         """Return all parameters with their learning rates."""
-        field, options = self.field, self._options
+        field = self.field
         groups = [
-            ParameterGroup("density", tuple(field.density.parameters()), self._decaying(options.grid_rate)),
-            ParameterGroup("appearance", tuple(field.appearance.parameters()), self._decaying(options.grid_rate)),
-            ParameterGroup("shader", tuple(field.shader.parameters()), self._decaying(options.network_rate)),
+            ParameterGroup("density", tuple(field.density.parameters()), self._decaying(GRID_RATE)),
+            ParameterGroup("appearance", tuple(field.appearance.parameters()), self._decaying(GRID_RATE)),
+            ParameterGroup("shader", tuple(field.shader.parameters()), self._decaying(NETWORK_RATE)),
         ]
         if field.environment is not None:
-            rate = self._decaying(options.environment_rate)
+            rate = self._decaying(ENVIRONMENT_RATE)
             groups.append(ParameterGroup("environment", tuple(field.environment.parameters()), rate))
         return groups
 
@@ -93,7 +98,7 @@ class EgoNeRFModel:
 
     def _decaying(self, rate: float) -> LogLinear:
         """Return an exponential decay from `rate` over the run."""
-        return LogLinear(rate, rate * self._options.rate_decay, self._iterations)
+        return LogLinear(rate, rate * RATE_DECAY, self._iterations)
 
 
 class RayTrainer(Trainer):
@@ -141,7 +146,80 @@ class RayTrainer(Trainer):
         return read, {"rays": self._rays}
 
     def _update(self, iteration: int, step: int) -> tuple[str, ...]:
-        self._optimizer.check(iteration, step)
+        self._optimizer.check(iteration)
         with self._stage("optimizer"):
             self._optimizer.step(step)
         return (self._model.summary(),) if iteration == 1 else ()
+
+
+@dataclass(frozen=True)
+class Rays:
+    """B rays and their ground truth."""
+
+    origins: Tensor  # [B, 3] float64 world
+    directions: Tensor  # [B, 3] unit, world
+    color: Tensor  # [B, 3] in [0, 1]
+    weight: Tensor  # [B] > 0
+
+
+class RayPixels:
+    """All unmasked pixels of some views; 7 bytes per pixel, 11 if weights differ.
+
+    Attributes:
+        generator: all random choices of an iteration.
+    """
+
+    def __init__(
+        self, views: Sequence[View], weight: str = "uniform", device: torch.device | str = "cpu", seed: int = 0
+    ) -> None:
+        """Load every view once; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
+        colors, places, weights = [], [], []
+        tables: dict[Camera, tuple[int, Tensor]] = {}  # start among all directions, directions
+        starts, total = [], 0
+        for view in views:
+            image, of_pixel = image_of(view, device), weight_of(view, weight, device)
+            of_pixel = of_pixel.expand(view.height, view.width).reshape(-1)
+            kept = of_pixel.nonzero().squeeze(-1)
+            colors.append((image.reshape(-1, 3)[kept] * 255).round().to(torch.uint8))
+            places.append(kept.to(torch.int32))
+            weights.append(of_pixel[kept])
+            if view.camera not in tables:
+                tables[view.camera] = total, view.camera.rays(device=device).reshape(-1, 3)
+                total += view.width * view.height
+            starts.append(tables[view.camera][0])
+        self._colors, self._places = torch.cat(colors), torch.cat(places)
+        self._weights = None if all((w == 1).all() for w in weights) else torch.cat(weights)
+        self._directions = torch.cat([table for _, table in tables.values()])
+        self._starts = torch.tensor(starts, device=device)
+        self._ends = torch.tensor([len(place) for place in places], device=device).cumsum(0)
+        self._centers = torch.stack([view.center.double() for view in views]).to(device)
+        self.generator = torch.Generator().manual_seed(seed)
+        self._rotations = torch.stack([view.cam_from_world[:3, :3] for view in views]).to(self._directions)
+
+    def __len__(self) -> int:
+        return len(self._colors)
+
+    def draw(self, count: int) -> Rays:
+        """Return `count` rays through the centres of random pixels, uniformly, with replacement."""
+        return self.at(torch.randint(len(self), (count,), generator=self.generator).to(self._colors.device))
+
+    def at(self, indices: Tensor) -> Rays:
+        """Return the rays through pixels [B], counted view by view and row by row."""
+        view = torch.searchsorted(self._ends, indices, right=True)
+        in_camera = self._directions[self._starts[view] + self._places[indices]]
+        directions = torch.einsum("bc,bcw->bw", in_camera, self._rotations[view])
+        weight = torch.ones_like(directions[:, 0]) if self._weights is None else self._weights[indices]
+        return Rays(self._centers[view], directions, self._colors[indices].to(directions) / 255, weight)
+
+    def state(self) -> State:
+        """Return the random state."""
+        return State({"random/rays": self.generator.get_state()}, {"pixels": len(self)})
+
+    def load(self, state: State) -> None:
+        """Restore it from the state of a trainer."""
+        if state.values["pixels"] != len(self):
+            raise ValueError(
+                f"the state is of a run on {state.values['pixels']} pixels, but the training views have {len(self)}; "
+                "resume with the data it was trained on"
+            )
+        self.generator.set_state(state.tensors["random/rays"].cpu())

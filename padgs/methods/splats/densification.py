@@ -64,8 +64,7 @@ class DensificationOptions:
     def for_run(self, iterations: int) -> DensificationOptions:
         """Return the options for a run of another length: each window is the same share of the run as published.
 
-        Intervals shrink too, but not below `MIN_DENSIFY_EVERY` and `MIN_RESET_EVERY`, so short runs have fewer rounds
-        and resets.
+        Intervals shrink too, but not below `MIN_DENSIFY_EVERY` and `MIN_RESET_EVERY`.
         """
         every = scaled(self.densify_every, iterations)
         return replace(
@@ -127,10 +126,7 @@ class Densifier:
     def adapt(
         self, iteration: int, optimizer: torch.optim.Adam, *, grows: Callable[[], bool] = lambda: True
     ) -> tuple[str, ...]:
-        """Clone, split, prune and reset opacities if it is time to; return events.
-
-        `grows` is called when a round is due and decides whether it takes place.
-        """
+        """Clone, split, prune and reset opacities if it is time to, and `grows()` in a round; return events."""
         options = self.options
         if iteration >= options.densify_until:
             return ()
@@ -180,10 +176,7 @@ class Densifier:
         return chosen
 
     def _towards_target(self, mean_gradient: Tensor, seen: Tensor, iteration: int) -> Tensor:
-        """Return which Gaussians [N] are cloned or split in this round on the way to the target.
-
-        With absolute gradients half of them are chosen by these.
-        """
+        """Return which Gaussians [N] multiply on the way to the target, half of them by absolute gradients if known."""
         assert self._target is not None
         rounds = 1 + (self.options.densify_until - 1 - iteration) // self.options.densify_every  # with this one
         count = max(0, self._target - len(seen)) // rounds

@@ -53,8 +53,7 @@ def most_important(scores: Importance, count: int) -> Tensor:
     """Return the rows [count] with the largest `change`, in ascending order; ties go to the first.
 
     The change of the renders ranks better than the change of their error: refinement changes the residual anyway, and
-    rows that do harm one by one are often needed together. On `flat` (padgs_plus, 21 600 Gaussians), removing 30 %
-    without refinement costs 0.09 dB by change, 0.29 by error, 0.54 by contribution and 0.79 by the largest weight.
+    rows that do harm one by one are often needed together (docs/plus.md).
     """
     order = torch.argsort(scores.change, descending=True, stable=True)
     return order[:count].sort().values
@@ -63,21 +62,15 @@ def most_important(scores: Importance, count: int) -> Tensor:
 def count_for_psnr(scores: Importance, psnr: float) -> int:
     """Return how many rows stay if the least important are removed until their changes add up to a PSNR, dB.
 
-    Changes of single rows underestimate the change by all of them, because rows replace each other: renders right after
-    pruning have 19 to 40 dB to those before, and the rest of the training recovers that (docs/plus.md). At least
-    `MIN_KEPT_SHARE` stays: where nearly all rows replace each other, the sum means nothing.
+    The sum underestimates the change by all of them, because rows replace each other; training recovers that
+    (docs/plus.md). At least `MIN_KEPT_SHARE` stays: where nearly all rows replace each other, the sum means nothing.
     """
     changes = scores.change.sort().values.cumsum(0)
     return max(math.ceil(MIN_KEPT_SHARE * len(changes)), int((changes > 10 ** (-psnr / 10)).sum()))
 
 
 class PruningStep:
-    """Schedule of the one pruning by importance, a round after densification ends.
-
-    Attributes:
-        due: its iteration.
-        done: whether it has taken place.
-    """
+    """Schedule of the one pruning by importance, a round after densification ends, at iteration `due` unless `done`."""
 
     def __init__(
         self,
@@ -89,9 +82,7 @@ class PruningStep:
     ) -> None:
         """Plan the step for a run of `iterations`, whose `options` are from `DensificationOptions.for_run`.
 
-        Args:
-            requested: `budget.gaussians`: the number that stays; auto or None: as many as `count_for_psnr` says.
-            prune_psnr: dB for `count_for_psnr`; None: nothing is pruned.
+        `requested` is `budget.gaussians`: the number that stays; auto or None: `count_for_psnr(prune_psnr)`.
         """
         self._iterations, self._requested, self._prune_psnr = iterations, requested, prune_psnr
         self.due = options.densify_until - 1 + options.densify_every

@@ -30,11 +30,7 @@ DEGREE_EVERY = 1000  # published iterations between two SH degrees
 class SplatModel:
     """Splats with the schedule of 3DGS for a run of `iterations`; a `padgs.training.model.Model`.
 
-    Attributes:
-        splats: the parameters.
-        options: of a published run.
-        densifier: adds and removes Gaussians.
-        pruning: removes the least important Gaussians once densification has ended.
+    The `densifier` adds and removes Gaussians; `pruning` removes the least important once densification has ended.
     """
 
     def __init__(
@@ -85,7 +81,7 @@ class SplatModel:
             "sh_rest": Constant(2.5e-3 / 20),
         }
         rows = splats.rows()
-        return [ParameterGroup(name, (rows[name],), rate, is_of_rows=True) for name, rate in rates.items()]
+        return [ParameterGroup(name, (rows[name],), rate) for name, rate in rates.items()]
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians, differentiably.
@@ -133,8 +129,7 @@ class SplatModel:
     def _has_enough_views(self) -> bool:
         """Return whether the mean gradients of a round are over enough views.
 
-        If the schedule follows the clock, a round may come after few views. It is skipped: densification by noise makes
-        the model larger and its iterations fewer, which makes the next round noisier still.
+        If the schedule follows the clock, a round may come after few views, whose gradients are noise: it is skipped.
         """
         if len(self.splats) == 0:  # the next render ends the run
             return False

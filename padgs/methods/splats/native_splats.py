@@ -68,10 +68,7 @@ def call_cuda(sizes: tuple, center: Tensor, tiny: float, *tensors: Tensor | None
 
 
 def native_splats(parameters: Parameters, degree: int, center: Tensor, tiny: float, call: Call = call_cpu) -> Evaluated:
-    """Evaluate Gaussians for a camera, differentiably by all parameters and by the offsets.
-
-    `degree` is the SH degree in use, `center` [3] that of the camera, `tiny` a length added to distances, in squares.
-    """
+    """Evaluate Gaussians of an SH degree for a camera at `center` [3], differentiably; `tiny` is added to distances."""
     return Evaluated(*_Splats.apply(call, degree, center.contiguous(), tiny, *parameters))
 
 

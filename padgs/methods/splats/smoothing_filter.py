@@ -1,8 +1,7 @@
 """3D smoothing filter (Mip-Splatting, Yu et al. 2024): no Gaussian is thinner than the training views could resolve.
 
-A pixel filter follows the camera that renders, so a camera that is nearer than all training views, or has smaller
-pixels, would show Gaussians as needles that no training view ever constrained. The filter keeps them as wide as the
-pixel filter of the training view with the finest pixel at that place makes them.
+A nearer camera, or one with smaller pixels, would show Gaussians as needles that no training view constrained. The
+filter keeps them as wide as the pixel filter of the training view with the finest pixel at that place makes them.
 """
 
 from __future__ import annotations
@@ -56,10 +55,7 @@ def smoothed_for_view(gaussians: Gaussians, view: View, pixels: Tensor, variance
 class SmoothingFilter:
     """3D filter as in SPaGS: adds a share of the finest training pixel to every Gaussian, in training and rendering.
 
-    The added variance has no derivative and follows the means whenever it is updated.
-
-    Attributes:
-        variances: [N] added variance, world units squared; empty before the first `update`.
+    The added `variances` [N], world units squared, have no derivative and follow the means whenever they are updated.
     """
 
     def __init__(self, square_pixels: float, cameras: Tensor) -> None:

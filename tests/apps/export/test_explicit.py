@@ -20,7 +20,7 @@ from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import protocol_from_options
 from padgs.geometry import harmonics
 from padgs.render import RenderOptions, render
-from padgs.training.align import Similarity
+from padgs.training.corrections import Similarity
 
 RULES = protocol_from_options("sphere", lpips="none", metrics=["ws_psnr"])
 

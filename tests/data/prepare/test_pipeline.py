@@ -18,7 +18,7 @@ from padgs.data.prepare import pipeline, sfm, work
 from padgs.data.prepare.pipeline import prepare
 from padgs.data.prepare.work import PrepareOptions
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.training.align import align
+from padgs.training.corrections import align
 
 VIEWS = 6
 

@@ -2,22 +2,24 @@
 
 import math
 from dataclasses import replace
-from time import process_time
 from typing import Any
 
 import pytest
 import torch
-from support.composed import composed
 from support.tiny_scene import in_other_units, tiny_scene
 from torch.nn.functional import normalize, softplus
 
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.geometry.camera import Pinhole, RayTable
-from padgs.methods.egonerf.field import EgoNeRF, EnvironmentMap, cloud_reach, surroundings_of
-from padgs.methods.egonerf.options import Constants, EgoNeRFOptions
-from padgs.runs.run import build_method
+from padgs.methods.egonerf.field import (
+    Constants,
+    EgoNeRF,
+    EgoNeRFOptions,
+    EnvironmentMap,
+    cloud_reach,
+    surroundings_of,
+)
 from padgs.scene import Scene, View
-from padgs.training.options import Budget
 
 SMALL = EgoNeRFOptions(
     radial_nodes=16,
@@ -77,22 +79,9 @@ def test_published_number_of_parameters():
     ("surroundings", "unit", "published"),
     [("outdoor", 5.0, (-10.0, 25.0, 0.1, 300.0, 0.05, True)), ("indoor", 2.5, (-8.0, 25.0, 0.01, 15.0, 0.03, False))],
 )
-def test_scene_units_match_published_constants(generator, surroundings, unit, published):
+def test_scene_units_match_published_constants(surroundings, unit, published):
     """Lengths are published in units of the data; the optical depth of a length is the same, too."""
-    world = tiny_scene()
-    world = in_other_units(world, unit / world.scale)
-    assert world.scale == pytest.approx(unit)
-    free = dict.fromkeys(Constants._fields)
-    ours, theirs = (
-        dense(replace(SMALL, **free, surroundings=surroundings, length_unit=unit_of_lengths), world)
-        for unit_of_lengths in ("scene", "world")
-    )
-    assert theirs.constants == published
-    origins, directions = rays(50, generator)  # positions inside are in the model's unit
-    seen = [ours.trace(origins, directions), theirs.trace(unit * origins, directions)]
-    assert 0.01 < seen[0].transmittance.mean() < 0.95
-    assert torch.allclose(seen[0].transmittance, seen[1].transmittance, rtol=1e-3, atol=1e-5)
-    assert torch.allclose(seen[0].color, seen[1].color, atol=1e-4)
+    assert EgoNeRFOptions().constants(surroundings).in_units_of(1 / unit) == pytest.approx(Constants(*published))
 
 
 def test_constant_density_absorbs_exponentially(generator):
@@ -190,11 +179,6 @@ def test_rendering_is_invariant_to_world_units(scale):
     assert torch.allclose(a.depth * scale, b.depth, rtol=1e-3)
 
 
-def test_length_unit_world_takes_lengths_as_given():
-    model = EgoNeRF.from_scene(in_other_units(tiny_scene(), 100.0), replace(SMALL, length_unit="world"))
-    assert model.unit == 1.0 and model.travel > 20
-
-
 def test_the_centre_is_the_mean_of_the_training_cameras():
     scene = tiny_scene()
     model = EgoNeRF.from_scene(scene, SMALL)
@@ -232,7 +216,6 @@ def test_gradients_of_colours(generator):
     "changes, reason",
     [
         ({"polar_nodes": 9}, "polar_nodes is 9; it must be even"),
-        ({"length_unit": "km"}, "unknown length_unit 'km'; known: scene, world"),
         ({"near": 0.0}, "near is 0.0"),
         ({"far": 0.06}, "far - near larger than first_radius"),
         ({"samples_at_once": 10}, "less than the 48 of a single ray"),
@@ -243,23 +226,6 @@ def test_gradients_of_colours(generator):
 def test_invalid_options_are_refused(changes, reason):
     with pytest.raises(ValueError, match=reason):
         replace(SMALL, **changes)
-
-
-@pytest.mark.slow
-def test_time_of_the_small_preset(monkeypatch, root):
-    """500 steps of 1024 rays in 3 minutes and 256x128 in 20 s on 2 cores: twice that in processor time."""
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
-    records = small.fit(scene, Budget(500))
-    for _ in range(5):
-        next(records)
-    start = process_time()
-    for _ in range(20):
-        next(records)
-    assert (process_time() - start) * 500 / 20 < 2 * 180  # measured: 135
-    start = process_time()
-    small.render(replace(scene.test[0], width=256, height=128))
-    assert process_time() - start < 2 * 20  # measured: 4.7
 
 
 HEIGHT = 6

@@ -7,7 +7,8 @@ import torch
 from support.tiny_scene import tiny_scene
 
 from padgs.geometry.camera import Pinhole
-from padgs.methods.egonerf.rays import RayPixels, interval_lengths, inverse_cdf, jittered, refined, visible_shares
+from padgs.methods.egonerf.grids import interval_lengths, inverse_cdf, jittered, refined, visible_shares
+from padgs.methods.egonerf.model import RayPixels
 from padgs.scene import View
 
 

@@ -61,7 +61,7 @@ def decoded(anchors: int = 3000) -> dict[str, Tensor]:
     leaf = {key: value.requires_grad_() for key, value in leaf.items()}
     seen, positions, attenuation = randn(anchors, 4), randn(anchors, 3), torch.rand(anchors, generator=generator)
     tensors = SeenAnchors(seen=seen, positions=positions, attenuation=attenuation, **leaf)
-    gaussians, slots, raw = decode_gaussians(weights, tensors)
+    gaussians, slots, raw, _ = decode_gaussians(weights, tensors)
     loss = sum((value * randn(*value.shape)).sum() for value in vars(gaussians).values())
     flat = [*leaf.values(), *(tensor for head in weights for tensor in head)]
     gradients = torch.autograd.grad(loss, flat)

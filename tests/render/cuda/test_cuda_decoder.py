@@ -17,7 +17,6 @@ from padgs.methods.anchors.decoder import (
     DecoderWeights,
     SeenAnchors,
     decode_gaussians,
-    decode_with_capacity,
     define_gaussians,
 )
 from padgs.methods.anchors.native_decoder import GRADIENT_TYPE, PRECISIONS, decode_on_gpu, reduced_dtype
@@ -29,14 +28,15 @@ problem = functools.partial(decoder_cases.problem, device=DEVICE)
 
 
 def on_gpu(
-    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
-) -> tuple[Gaussians, Tensor, Tensor]:
+    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32", capacity: int | None = None
+) -> tuple[Gaussians, Tensor, Tensor, Tensor | None]:
     """Decode as `decode_gaussians` does for tensors of a GPU."""
     if cuda_engine.ON_GPU:
-        return decode_gaussians(weights, anchors, precision)
-    flat = tuple(tensor for head in weights for tensor in head)
-    *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision))
-    return Gaussians(*values), slots, raw
+        return decode_gaussians(weights, anchors, precision, capacity)
+    flat, rows = tuple(tensor for head in weights for tensor in head), anchors.offsets[..., 0].numel()
+    capacity = None if capacity is None else min(capacity, rows)
+    *values, slots, raw, count = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision), capacity=capacity)
+    return Gaussians(*values), slots, raw, count
 
 
 @pytest.mark.parametrize("anchors", [1, 17, 300])
@@ -177,13 +177,11 @@ EVERY_PRECISION = pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("rows", ["all", "some more", "too few"])
 def test_decoding_with_capacity_pads_with_zeros(precision: str, rows: str, generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
-    exact, slots, raw = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)
+    exact, slots, raw, _ = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)
     count = len(exact)
     assert 100 < count < 500
     capacity = {"all": 1000, "some more": count + 30, "too few": count - 30}[rows]
-    within, all_slots, same_raw, said = decode_with_capacity(
-        decoder.weights(), SeenAnchors(**tensors), capacity, precision
-    )
+    within, all_slots, same_raw, said = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision, capacity)
     assert said.tolist() == [count] and len(within) == len(all_slots) == min(capacity, 600)
     for name, value in vars(exact).items():
         found = getattr(within, name)
@@ -200,7 +198,7 @@ def test_gaussians_beyond_capacity_have_no_gradient(precision: str, generator: t
     upstream, found = torch.randn(count - 30, 3, generator=generator), []
     leaves = [tensors[name].requires_grad_() for name in LEARNED]
     for capacity in (count - 30, count):
-        gaussians = decode_with_capacity(decoder.weights(), SeenAnchors(**tensors), capacity, precision)[0]
+        gaussians = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision, capacity)[0]
         loss = sum((getattr(gaussians, of)[: count - 30] * upstream).sum() for of in ("means", "scales", "colors"))
         found.append(torch.autograd.grad(loss, [*leaves, *decoder.parameters()], allow_unused=True))
     for less, all_of_them in zip(*found, strict=True):
@@ -225,14 +223,8 @@ def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: 
     tensors, decoder = problem(60, 10, 37, 32, generator)
 
     def within(weights: DecoderWeights, anchors: SeenAnchors, precision: str):
-        gaussians, slots, raw, count = decode_with_capacity(weights, anchors, 600, precision)
+        gaussians, slots, raw, count = on_gpu(weights, anchors, precision, 600)
         return gaussians.first(int(count)), slots, raw
 
     exact, padded = (decoded(function, tensors, decoder, precision)[3] for function in (on_gpu, within))
     assert all(torch.equal(padded[name], gradient) for name, gradient in exact.items())
-
-
-def test_decoding_with_capacity_requires_the_gpu_library(generator: torch.Generator):
-    tensors, decoder = problem(3, 10, 37, 32, generator)
-    with pytest.raises(ValueError, match="decoding with a capacity takes float32 on a GPU; got torch.float64 on "):
-        decode_with_capacity(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())), 30)

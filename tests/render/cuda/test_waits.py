@@ -18,7 +18,7 @@ from torch import Tensor
 
 from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
-from padgs.methods.anchors.model import AnchorModel
+from padgs.methods.anchors.method import AnchorModel
 from padgs.methods.anchors.native_decoder import PRECISIONS
 from padgs.methods.splats.densification import POSITIONAL_GRADIENTS, DensificationOptions
 from padgs.methods.splats.model import SplatModel
@@ -90,7 +90,7 @@ def test_padgs_iterations_do_not_wait(precision: str, monkeypatch: pytest.Monkey
     trainer, waited = trained(precision)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts Gaussians and instances
     ahead = learned(trainer)
-    monkeypatch.setattr("padgs.methods.anchors.model.resolve_backend", lambda *_: "another")
+    monkeypatch.setattr("padgs.methods.anchors.method.resolve_backend", lambda *_: "another")
     exact, waited = trained(precision)
     assert all(waited), "with as many rows as there are Gaussians it waits"
     for name, tensor in learned(exact).items():
@@ -100,7 +100,7 @@ def test_padgs_iterations_do_not_wait(precision: str, monkeypatch: pytest.Monkey
 
 def test_too_small_capacity_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     enough = learned(trained("float32")[0])
-    monkeypatch.setattr("padgs.methods.anchors.model.HEADROOM", 0.5)
+    monkeypatch.setattr("padgs.methods.anchors.method.HEADROOM", 0.5)
     trainer, waited = trained("float32")
     assert any(waited[2:]), "it was decoded once more"
     for name, tensor in learned(trainer).items():

@@ -1,8 +1,8 @@
-"""3DGS (Kerbl et al. 2023) on the faces of a cube, the common way to use a 360 degree camera.
+"""3DGS (Kerbl et al. 2023) on perspective views cut from the panoramas: cube faces, or overlapping crops of one lens.
 
-Each training panorama becomes six perspective views of 90 degrees. Test panoramas are rendered face by face
-(`padgs.render.cubemap`). An iteration trains on as many views as cover the sphere once, like an iteration of a
-panoramic method.
+Test panoramas are rendered face by face (`padgs.render.cubemap`). An iteration trains on as many views as cover the
+sphere once, like an iteration of a panoramic method. Crops look along the vertices of an icosahedron, none along the
+vertical axis of the panorama; they overlap, so that every direction is inside some crop.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
+from padgs.data.perspectives import looking_at, perspective_scene, solid_angle, square_lens
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import SplatModel
@@ -26,6 +26,14 @@ from padgs.training.corrections import GIVEN
 from padgs.training.loop import Record, Stage, Trainer
 from padgs.training.model import Model
 from padgs.training.options import Budget
+
+GOLDEN = (1 + math.sqrt(5)) / 2
+ICOSAHEDRON = [
+    vertex for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN) for vertex in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
+]
+# Degrees across each square crop. Below 74.75, twice the angle between a vertex and the centre of a face, crops would
+# not cover the sphere.
+FIELD_OF_VIEW = 75.0
 
 
 def cut_view_options(options: RenderOptions) -> RenderOptions:
@@ -45,7 +53,7 @@ class CutModel(SplatModel):
 
 
 class Cubemap3DGSMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
+    """3DGS on the faces of a cube; see `padgs.training.method.Method`."""
 
     MODEL = CutModel
     CUT_FINENESS = FINENESS
@@ -99,3 +107,15 @@ class Cubemap3DGSMethod(SplatMethod):
         """See `Method.build_trainer`."""
         each = self._views_per_step
         return Trainer(model, scene, budget, self.train_options, self.seed, views_each=each, stage=stage)
+
+
+class Crops3DGSMethod(Cubemap3DGSMethod):
+    """The same on twelve overlapping crops; see `Cubemap3DGSMethod`."""
+
+    def turns(self) -> Tensor:
+        """Return rotations [12, 3, 3] from the camera frame of a panorama to those of the crops."""
+        return looking_at(ICOSAHEDRON)
+
+    def lens(self, panorama: Panorama) -> Pinhole:
+        """Return the camera of the crops."""
+        return square_lens(panorama, math.tan(math.radians(FIELD_OF_VIEW / 2)), FINENESS)
