@@ -35,7 +35,7 @@ class View:
     load_pixels: Callable[[], Tensor] | None = None  # () -> [H, W, 3] uint8
     load_mask: Callable[[], Tensor] | None = None  # () -> [H, W] float32 in [0, 1], 0 = ignore this pixel
     lens: Camera | None = None  # None: a panorama of this size
-    load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] true distance, world units, inf = sky
+    load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] distance along the ray; 0, NaN = unknown, inf = sky
 
     @property
     def camera(self) -> Camera:

@@ -75,7 +75,13 @@ class Trainer:
         self._optimizer = Optimizer(groups, options.check_every, **self.ADAM)
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out, device = self._early_stopping.held_out, self._optimizer.device
-        self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out)
+        uses_depth, self._unit = options.depth_weight > 0, scene.scale
+        if uses_depth and not any(view.load_depth for view in scene.train):
+            raise ValueError(
+                f"train.depth_weight is {options.depth_weight}, but no training view has a depth map; put depths/ "
+                "beside images/, or set 0"
+            )
+        self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=uses_depth)
         self._order: Any = self._views  # its state decides which data the next iterations see
         pixels = sum(view.width * view.height for view in scene.train)
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
@@ -143,7 +149,7 @@ class Trainer:
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
-                loss = target.loss(image, options.lambda_l1, options.normalisation)
+                loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
             if checked:

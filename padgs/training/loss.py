@@ -22,6 +22,7 @@ from padgs.native.abi import LossArguments, pointer
 WINDOW, SIGMA = 11, 1.5  # SSIM window in pixels
 C1, C2 = 0.01**2, 0.03**2
 NORMALISATIONS = ("mean", "channel_sum")
+MEASURED, MONOCULAR = DEPTH_KINDS = ("measured", "monocular")
 
 
 ROW_WEIGHTS = {
@@ -67,6 +68,30 @@ def photometric_loss(
         return loss
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target))
     return (weight[..., None] * per_channel).sum() / total
+
+
+def inverse_range_loss(depth: Tensor, truth: Tensor, weight: Tensor, unit: float, kind: str = MEASURED) -> Tensor:
+    """Return the weighted mean of |unit / depth - unit / truth| over pixels with a known truth, a scalar.
+
+    Inverse ranges of far surfaces, whose range is the least certain, differ least. Differentiable by `depth`.
+
+    Args:
+        depth: [H, W] of a render; pixels where nothing is drawn, 0, are left out.
+        truth: [H, W]; 0, NaN or negative: unknown, inf: sky.
+        weight: [H, W] or [H, 1].
+        unit: length that makes inverse ranges plain numbers, such as the scene scale.
+        kind: monocular: a scale and a shift of the inverse truth are fitted to the render by least squares; the loss is
+            0 if that turns near and far around.
+    """
+    known = (truth > 0) & (depth > 0)
+    weight = (weight * known) / (weight * known).sum().clamp(min=1e-12)
+    rendered, inverse = unit / torch.where(known, depth, unit), unit / torch.where(known, truth, unit)
+    if kind == MONOCULAR:
+        given, drawn = (values - (weight * values).sum() for values in (inverse, rendered.detach()))
+        slope = (weight * given * drawn).sum() / (weight * given * given).sum().clamp(min=1e-12)
+        inverse = slope.clamp(min=0) * given + (weight * rendered.detach()).sum()
+        weight = weight * (slope > 0)
+    return (weight * (rendered - inverse).abs()).sum()
 
 
 def pixel_weight(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from padgs.checks import check, check_known
 from padgs.training.corrections import CHOICES, GIVEN, LENSES, POSE_RATES
-from padgs.training.loss import NORMALISATIONS, ROW_WEIGHTS
+from padgs.training.loss import DEPTH_KINDS, NORMALISATIONS, ROW_WEIGHTS
 from padgs.training.schedule import LEARNING_RATES
 
 AUTO = "auto"  # number of Gaussians or iterations as needed
@@ -88,12 +88,19 @@ class TrainOptions:
     # Of all panoramas. map: a small distortion, a free map of directions (SC-OmniGS). fisheyes_x, _y, _z: two fisheye
     # lenses apart along an axis of the camera, stitched as one; test views have one centre (Seam360GS).
     lens: str = GIVEN
+    # Of a loss on inverse range, in scene scales, in training views that have a depth map; 0: none.
+    depth_weight: float = 0.0
+    # measured: in world units, also for initial points. monocular: inverse ranges up to a scale and a shift of each
+    # view, which are fitted to each render.
+    depth_kind: str = "measured"
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
     hold_out: int | None = None  # train without a fold of the views: `padgs.training.health.validation_folds`
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
         check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES)
+        check_known(self, depth_kind=DEPTH_KINDS)
+        check(self, ">= 0 and finite", lambda weight: 0 <= weight < math.inf, "depth_weight")
         check_known(self, poses=(GIVEN, *POSE_RATES), lens=LENSES)
         if isinstance(self.learning_rates, str):
             check_known(self, learning_rates=LEARNING_RATES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,8 +13,11 @@ from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama
 from padgs.scene import Scene, View
-from padgs.training.loss import photometric_loss, pixel_weight
+from padgs.training.loss import inverse_range_loss, photometric_loss, pixel_weight
 from padgs.training.model import State
+
+if TYPE_CHECKING:
+    from padgs.training.options import TrainOptions
 
 CACHE_BYTES = 1 << 29  # weights of views beyond this are computed again at every iteration
 MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
@@ -25,10 +29,15 @@ class Target:
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
+    depth: Tensor | None = None  # [H, W] as in `View.load_depth`, if it is used
 
-    def loss(self, image: Tensor, lambda_l1: float, normalisation: str) -> Tensor:
-        """Return the photometric loss of an image [H, W, 3], a scalar."""
-        return photometric_loss(image, self.image, self.weight, lambda_l1, normalisation=normalisation)
+    def loss(self, image: Tensor, depth: Tensor, options: TrainOptions, unit: float) -> Tensor:
+        """Return the loss of an image [H, W, 3] and its depth [H, W], a scalar; `unit` is the scene scale."""
+        loss = photometric_loss(image, self.image, self.weight, options.lambda_l1, normalisation=options.normalisation)
+        if self.depth is None:
+            return loss
+        more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
+        return loss + options.depth_weight * more
 
 
 class Targets:
@@ -39,10 +48,16 @@ class Targets:
     """
 
     def __init__(
-        self, views: Sequence[View], weight: str, device: torch.device | str = "cpu", coarse_share: float = 0.0
+        self,
+        views: Sequence[View],
+        weight: str,
+        device: torch.device | str = "cpu",
+        coarse_share: float = 0.0,
+        *,
+        depth: bool = False,
     ) -> None:
-        """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
-        self._weight, self._device, self._coarse_share = weight, device, coarse_share
+        """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`; `depth`: use depth maps."""
+        self._weight, self._device, self._coarse_share, self._depth = weight, device, coarse_share, depth
         self._weights: dict[tuple[int, int], Tensor] = {}  # by the number of halvings and the index of the view
         self._bytes_left = CACHE_BYTES
         self._levels = [views]
@@ -66,12 +81,17 @@ class Targets:
             if weight.nbytes <= self._bytes_left:
                 self._bytes_left -= weight.nbytes
                 self._weights[level, index] = weight
-        return view, Target(image, weight)
+        return view, Target(image, weight, depth_of(view, self._device) if self._depth else None)
 
 
 def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
     """Return the image [H, W, 3] of a view, in [0, 1]; ValueError if there is none, or one of another size."""
     return _checked_size(view, "image", view.image(device=device))
+
+
+def depth_of(view: View, device: torch.device | str = "cpu") -> Tensor | None:
+    """Return the depth map [H, W] of a view, world units, or None; one of another size is a ValueError."""
+    return None if view.load_depth is None else _checked_size(view, "depth map", view.load_depth().to(device).float())
 
 
 def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
@@ -103,6 +123,7 @@ def _checked_size(view: View, what: str, pixels: Tensor) -> Tensor:
 def halved(view: View) -> View:
     """Return a panorama at half the width and height, each pixel the mean of those that it covers and no mask hides."""
     width, height, pixels, mask = view.width // 2, view.height // 2, view.load_pixels, view.load_mask
+    depth = view.load_depth
 
     def mean(image: Tensor) -> Tensor:
         return interpolate(image.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
@@ -127,7 +148,7 @@ def halved(view: View) -> View:
         height=height,
         load_pixels=None if pixels is None else small_pixels,
         load_mask=None if mask is None else small_mask,
-        load_depth=None,
+        load_depth=None if depth is None else lambda: interpolate(depth()[None, None], (height, width))[0, 0],
     )
 
 
@@ -142,10 +163,12 @@ class TrainingViews:
         coarse_share: float = 0.0,
         seed: int = 0,
         held_out: Collection[int] = (),
+        *,
+        depth: bool = False,
     ) -> None:
-        """Shuffle the views, except those `held_out` until `include_held_out`; `coarse_share` as in `Targets`."""
+        """Shuffle the views, except those `held_out` until `include_held_out`; other arguments as in `Targets`."""
         self._scene, self._held_out = scene, tuple(held_out)
-        self._targets = Targets(scene.train, weight, device, coarse_share)
+        self._targets = Targets(scene.train, weight, device, coarse_share, depth=depth)
         self.halvings = self._targets.halvings
         self._generator = torch.Generator().manual_seed(seed)
         self._order = self._shuffled()  # of this epoch

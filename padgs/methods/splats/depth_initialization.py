@@ -17,7 +17,7 @@ from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import sample
 from padgs.methods.splats.splats import Splats
 from padgs.scene import Scene, View
-from padgs.training.targets import even_weight, image_of
+from padgs.training.targets import depth_of, even_weight, image_of
 
 NEIGHBOURS = 4  # points that a depth is interpolated from
 MAX_SOURCE_VIEWS = 64  # training views that pixels are taken from, evenly spread
@@ -50,7 +50,7 @@ def solid_angle_pixels(view: View) -> float:
     return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)
 
 
-def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:
+def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator, measured: bool = False) -> Scene:
     """Return the scene with training pixels added as points, up to `count` points.
 
     Pixels are sampled by solid angle and mask. Their depth is interpolated from the cloud as that view sees it
@@ -61,6 +61,7 @@ def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator) -
         scene: with images; points that are not finite or at a camera centre are ignored.
         count: of points.
         generator: samples pixels, on the CPU.
+        measured: take depths from the depth maps of views that have one.
     """
     missing = count - len(scene.points)
     cloud = scene.points[torch.isfinite(scene.points).all(-1)].double().cpu()
@@ -68,7 +69,7 @@ def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator) -
         return scene
     views = scene.train[:: math.ceil(len(scene.train) / MAX_SOURCE_VIEWS)]
     per_view = math.ceil(missing / len(views))
-    parts = [_pixels_as_points(view, cloud, per_view, generator, scene.train) for view in views]
+    parts = [_pixels_as_points(view, cloud, per_view, generator, scene.train, measured) for view in views]
     points, colors = (torch.cat(part) for part in zip(*parts, strict=True))
     return replace(
         scene,
@@ -78,36 +79,41 @@ def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator) -
 
 
 def _pixels_as_points(
-    view: View, cloud: Tensor, count: int, generator: torch.Generator, others: Sequence[View]
+    view: View, cloud: Tensor, count: int, generator: torch.Generator, others: Sequence[View], measured: bool
 ) -> tuple[Tensor, Tensor]:
     """Return at most `count` pixels of a view as points [n, 3] float64 world, and their colours [n, 3] uint8."""
-    from scipy.spatial import KDTree
-
-    pose = view.cam_from_world.double().cpu()
-    camera_points = cloud @ pose[:3, :3].T + pose[:3, 3]
-    distances = camera_points.norm(dim=-1)
-    elsewhere = distances > 0
-    directions, inverse = (camera_points / distances[:, None])[elsewhere], 1 / distances[elsewhere]
-    if len(directions) == 0:
-        return cloud[:0], torch.zeros(0, 3, dtype=torch.uint8)
-
     weight = even_weight(view, torch.device("cpu")).double().expand(view.height, view.width).reshape(-1)
     cumulative = weight.cumsum(0)  # torch.multinomial is limited to 2^24 weights
     chosen = torch.rand(count, dtype=torch.float64, generator=generator) * cumulative[-1]
     pixels = torch.searchsorted(cumulative, chosen, right=True).clamp(max=len(cumulative) - 1)
-    rays = view.camera.rays(dtype=torch.float64).reshape(-1, 3)[pixels]
-
-    spacing = math.sqrt(4 * math.pi / len(directions))
-    nearest = KDTree(directions.numpy()).query(rays.numpy(), k=min(NEIGHBOURS, len(directions)))
-    angles, neighbours = (torch.as_tensor(part).reshape(count, -1) for part in nearest)
-    near = (angles < spacing).any(-1)
-    weights = 1 / angles[near].clamp(min=MIN_ANGLE).square()
-    inverse_depth = (weights * inverse[neighbours[near]]).sum(-1) / weights.sum(-1)
-    inverse_depth = plane_sweep(view, rays[near], inverse_depth, inverse[neighbours[near]], others)
-
+    rays, pose = view.camera.rays(dtype=torch.float64).reshape(-1, 3)[pixels], view.cam_from_world.double().cpu()
+    if measured and (depth := depth_of(view)) is not None:
+        inverse_depth = 1 / depth.double().reshape(-1)[pixels]
+        near = inverse_depth.isfinite() & (inverse_depth > 0)
+        inverse_depth = inverse_depth[near]
+    else:
+        near, inverse_depth = _interpolated(view, cloud @ pose[:3, :3].T + pose[:3, 3], rays, others)
     camera_frame = rays[near] / inverse_depth[:, None]
     colors = image_of(view, torch.device("cpu")).reshape(-1, 3)[pixels[near]]
     return (camera_frame - pose[:3, 3]) @ pose[:3, :3], (255 * colors).round().to(torch.uint8)
+
+
+def _interpolated(view: View, cloud: Tensor, rays: Tensor, others: Sequence[View]) -> tuple[Tensor, Tensor]:
+    """Return which rays [n] are near a point of the cloud [P, 3], camera frame, and their inverse depths."""
+    from scipy.spatial import KDTree
+
+    distances = cloud.norm(dim=-1)
+    elsewhere = distances > 0
+    directions, inverse = (cloud / distances[:, None])[elsewhere], 1 / distances[elsewhere]
+    if len(directions) == 0:
+        return torch.zeros(len(rays), dtype=torch.bool), distances[:0]
+    spacing = math.sqrt(4 * math.pi / len(directions))
+    nearest = KDTree(directions.numpy()).query(rays.numpy(), k=min(NEIGHBOURS, len(directions)))
+    angles, neighbours = (torch.as_tensor(part).reshape(len(rays), -1) for part in nearest)
+    near = (angles < spacing).any(-1)
+    weights = 1 / angles[near].clamp(min=MIN_ANGLE).square()
+    inverse_depth = (weights * inverse[neighbours[near]]).sum(-1) / weights.sum(-1)
+    return near, plane_sweep(view, rays[near], inverse_depth, inverse[neighbours[near]], others)
 
 
 def plane_sweep(view: View, rays: Tensor, inverse_depth: Tensor, around: Tensor, views: Sequence[View]) -> Tensor:

@@ -28,6 +28,7 @@ from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
 from padgs.scene import Scene, View
 from padgs.training.corrections import LEARNED, LEARNED_FAST
 from padgs.training.initial_points import ExtentOptions
+from padgs.training.loss import MEASURED
 from padgs.training.method import Method
 from padgs.training.model import State
 from padgs.training.options import AUTO, Budget, TrainOptions
@@ -131,7 +132,10 @@ class SplatMethod(Method):
         if count == 0 or self._loaded_state is not None or self._warm_start_state is not None:
             return scene, generator
         if self._filled is None or self._filled[0] is not scene or self._filled[1] != count:
-            self._filled = scene, count, fill_sparse_cloud(scene, count, generator=generator), generator.get_state()
+            options = self.train_options
+            measured = options.depth_weight > 0 and options.depth_kind == MEASURED
+            filled = fill_sparse_cloud(scene, count, generator=generator, measured=measured)
+            self._filled = scene, count, filled, generator.get_state()
         generator.set_state(self._filled[3])
         return self._filled[2], generator
 
