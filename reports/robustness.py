@@ -39,7 +39,7 @@ BEYOND = "beyond"
 UNITS = {"seam": "seam", "depth_error": "depth error", "ws_psnr_fitted": "dB after a fit of colours", "ws_psnr": "dB"}
 STATUS_LETTERS = {
     **{"oom": "M", "timeout": "T", "nan": "N", "diverged": "V", "collapsed": "C"},
-    **{"exploded": "E", "degenerate": "D", "silent": "S", "rejected": "R"},
+    **{"exploded": "E", "degenerate": "D", "rejected": "R"},
 }
 COLORS = "cividis"  # dark where nothing is left; readable for colour-blind readers
 LIGHT, DARK = "#fafafa", "#101010"  # numbers on dark and on bright cells
