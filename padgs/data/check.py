@@ -20,16 +20,15 @@ from padgs.data.conventions import (
     MIN_CORRELATION,
     MIN_GAIN,
     POINTS,
-    SMALL,
     VIEWS,
     colour_fit,
     exposure_gains,
     known_conventions,
     reprojection_errors,
+    small_images,
 )
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
-from padgs.data.store import area_resize
 from padgs.geometry.panorama import project
 from padgs.scene import Scene, View, move_origin
 
@@ -257,13 +256,7 @@ def _check_exposures(scene: Scene, report: Report) -> None:
 
 
 def _small(views: Sequence[View]) -> Tensor:
-    """Load the panoramas [F, H, W, 3] uint8, reduced to one width of at most `SMALL`."""
-    width = min(SMALL, *(view.width for view in views))
-    images = []
-    for view in views:
-        assert view.load_pixels is not None
-        images.append(torch.from_numpy(area_resize(view.load_pixels().cpu().numpy(), width, width // 2)))
-    return torch.stack(images)
+    return small_images(view.load_pixels().cpu().numpy() for view in views if view.load_pixels)
 
 
 def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:

@@ -7,14 +7,15 @@ strongly only if axes, handedness and direction of the poses are right, even if 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations, product
-from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
@@ -93,7 +94,7 @@ def best_reading(capture: Capture) -> Capture:
         step = max(1, len(poses) // VIEWS)
         fits = [0.0]
         with suppress(DataError):  # missing and damaged images are reported later
-            images = _small_images([frame.image for frame in capture.frames[::step][:VIEWS]])
+            images = small_images(decode(frame.image) for frame in capture.frames[::step][:VIEWS])
             if cloud.colors is not None:
                 fits = [
                     colour_fit(one.axes @ poses[::step][:VIEWS], images, _moved(cloud.points, one), cloud.colors)
@@ -114,11 +115,11 @@ def _moved(points: Tensor, reading: Reading) -> Tensor:
     return points.double() @ reading.world[:3, :3].T + reading.world[:3, 3]
 
 
-def _small_images(files: Sequence[Path]) -> Tensor:
-    """Decode panoramas [F, H, W, 3] uint8, reduced to one width of at most `SMALL`."""
-    images = [decode(file) for file in files]
-    width = min(SMALL, *(image.shape[1] for image in images))
-    return torch.stack([torch.from_numpy(area_resize(image, width, width // 2)) for image in images])
+def small_images(panoramas: Iterable[NDArray[np.uint8]]) -> Tensor:
+    """Reduce panoramas to one width of at most `SMALL`, one at a time; [F, H, W, 3] uint8."""
+    reduced = [area_resize(image, width := min(SMALL, image.shape[1]), width // 2) for image in panoramas]
+    width = min(image.shape[1] for image in reduced)
+    return torch.stack([torch.from_numpy(area_resize(image, width, width // 2)) for image in reduced])
 
 
 def known_conventions() -> list[Convention]:

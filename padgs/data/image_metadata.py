@@ -140,14 +140,6 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
     )
 
 
-def tilt_of(image: Image.Image) -> str | None:
-    """Return the stated pitch and roll of the camera; None if it was upright."""
-    xmp = _xmp(image)
-    angles = {name: stated(xmp, f"Pose{name}Degrees") for name in ("Pitch", "Roll")}
-    found = [f"{name.lower()} {text}" for name, text in angles.items() if text and text.strip("+-0.") != ""]
-    return " and ".join(found) or None
-
-
 def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:
     """Return the conversion to sRGB of RGB pixels by profile, gamma and colour space; None if they are sRGB.
 

@@ -26,7 +26,6 @@ from padgs.data.image_metadata import (
     refuse_rotated,
     refuse_several_pictures,
     srgb_conversion,
-    tilt_of,
 )
 from padgs.files import DAMAGE, ImageError, open_image
 
@@ -48,7 +47,6 @@ class ImageFile:
     digest: str
     crop: Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
     converted: bool = False  # whether other programs read other pixels, because the colours are not sRGB
-    tilt: str | None = None  # pitch and roll of the camera
 
 
 def inspect(path: Path, *, mask: bool = False) -> ImageFile:
@@ -66,7 +64,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
             refuse_several_pictures(image, path)
             mode, conversion = image.mode, None
             _refuse_other_modes(image, data, path, mask)
-            crop, tilt = crop_of(image, path), tilt_of(image)
+            crop = crop_of(image, path)
             if not mask:
                 conversion = srgb_conversion(image, data, path)
         except DAMAGE as error:
@@ -79,7 +77,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     if _looks_cut(data) or may_be_transparent:
         _decode(data, path, "L" if mask else "RGB")
     digest = hashlib.sha256(data).hexdigest()
-    return ImageFile(path, *size, digest, crop, conversion is not None, tilt)
+    return ImageFile(path, *size, digest, crop, conversion is not None)
 
 
 def _opened(data: bytes, path: Path) -> Image.Image:
@@ -111,11 +109,6 @@ def notes_on(images: Sequence[ImageFile]) -> list[str]:
         notes.append(f"images: parts of panoramas by their GPano data, the rest is masked: {names}")
     if converted := [image for image in images if image.converted]:
         notes.append(f"images: converted to sRGB: {listed(image.path.name for image in converted)}")
-    if tilted := [image for image in images if image.tilt is not None]:
-        notes.append(
-            f"images: {len(tilted)} say that the camera was tilted, such as {tilted[0].path.name} ({tilted[0].tilt} "
-            "degrees); poses must be those of the pixels as stored"
-        )
     return notes
 
 

@@ -124,14 +124,6 @@ def test_what_a_part_does_not_show_is_masked(world: World, tmp_path: Path) -> No
     assert source.masks[f"{first}.png"]().sum() == 16 * 32 and "the rest is masked" in source.notes[0]
 
 
-def test_a_tilted_camera_is_noted(world: World, tmp_path: Path) -> None:
-    write_colmap_text(world, tmp_path)
-    packet = xmp(PosePitchDegrees=0, PoseRollDegrees="-3.5")
-    image = Image.fromarray(world.images[0])
-    with_chunk(tmp_path / "images" / f"{world.names[0]}.png", image, png_chunk(b"iTXt", XMP + packet))
-    assert any(r"tilted, such as pano_00.png (roll -3.5 degrees)" in note for note in load(tmp_path).notes)
-
-
 def test_colours_are_converted_to_srgb(tmp_path):
     grey = Image.fromarray(np.full((64, 128, 3), 55, np.uint8))
     linear = with_chunk(tmp_path / "linear.png", grey, png_chunk(b"gAMA", struct.pack(">I", 100_000)))
