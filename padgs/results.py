@@ -32,7 +32,8 @@ STATUSES = {
 STOP_REQUESTED = "asked to stop and score"  # `ended` of a run stopped by the user, which is no repeat of a full run
 EXTERNAL = ("program", "version", "label")  # keys of Result.external; program and version may be empty
 AD_HOC = "ad_hoc"  # in `experiments`: the run was also requested without an experiment
-HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # word in the name of a metric
+# By a word in the name of a metric
+HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "rel": False, "delta": True}
 SMALLEST_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB; `padgs smallest` finds the smallest model for each
 SMALLEST_STATED = 0.1  # dB; the loss of the headline number, and of the model that is kept by default
 SMALLEST_PICTURED = (SMALLEST_STATED, 1.0)

@@ -29,6 +29,8 @@ LOADERS = {
     "roam360": "padgs.data.formats.published:read_roam360",
     "ricoh360": "padgs.data.formats.published:read_ricoh360",
     "omniblender": "padgs.data.formats.published:read_omniblender",
+    "ob3d": "padgs.data.formats.published:read_ob3d",
+    "tartanair": "padgs.data.formats.published:read_tartanair",
     "released": "padgs.data.formats.reconstructions:read_released",
     "synthetic": "padgs.data.synthetic:load",
 }

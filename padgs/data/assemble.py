@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
 from padgs.data.cloud import initial_cloud
+from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
 from padgs.data.masks import find_masks, masks_beside
 from padgs.data.splits import is_inside, spellings, split_frames
@@ -61,20 +62,23 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
         for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
+    views, depth_digests, depth_notes = with_depths(views, capture, options)
     scene = Scene(
-        name=Path(os.path.abspath(capture.folder)).name,  # works for "." too; a link keeps its own name
+        name=capture.name or Path(os.path.abspath(capture.folder)).name,  # works for "." too; a link keeps its name
         train=tuple(views[i] for i in split.train),
         test=tuple(views[i] for i in split.test),
         points=points,
         point_colors=colors,
         fingerprint="",
-        notes=(*notes, *split.notes, *mask_notes, *cloud_notes, *cache_notes),
+        notes=(*notes, *split.notes, *mask_notes, *depth_notes, *cloud_notes, *cache_notes),
     ).recentered()
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):
         digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
         digest.update(view.cam_from_world.numpy().tobytes())
     digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
+    if depth_digests:
+        digest.update(f"depths{depth_digests}".encode())
     digest.update(scene.points.numpy().tobytes())
     digest.update(colors.numpy().tobytes())
     return replace(scene, fingerprint=digest.hexdigest())

@@ -66,6 +66,7 @@ class Frame:
     width: int | None = None  # of the camera in pixels, if the format states it
     height: int | None = None
     mask: Path | None = None  # if the format names one
+    depth: Path | None = None  # if the format names one
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,19 @@ class Tracks:
         return Tracks(self.frame[some], self.point[some], self.pixels[some])
 
 
+class DepthMeaning(NamedTuple):
+    """Meaning of the numbers of depth maps; see `padgs.data.depths`."""
+
+    measure: str  # ray: distance along the ray; z: along the axis of the camera
+    unit: float  # world units of one step
+    source: str  # that states it
+
+    def __str__(self) -> str:
+        """Return the words for notes."""
+        what = "distance along the ray" if self.measure == "ray" else "z along the axis"
+        return f"{what} in steps of {self.unit:g} world units (by {self.source})"
+
+
 class Reading(NamedTuple):
     """One way to understand what the files of a format leave open."""
 
@@ -121,6 +135,8 @@ class Capture:
     width: int | None = None  # wider images are reduced to it if data.width is null; None = as stored
     tracks: Callable[[], Tracks] | None = None
     notes: tuple[str, ...] = ()
+    depth: DepthMeaning | None = None  # of the frames' depth maps
+    name: str | None = None  # of the scene, if it is not that of the folder
     readings: tuple[Reading, ...] = ()  # the first is the usual one; see `padgs.data.conventions.best_reading`
 
 
@@ -136,6 +152,7 @@ class DataSettings:
     images: str | None = None  # image folder, relative to the data set's; None = search
     points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative to the data set's folder
     mask: str = "auto"  # auto | none | inverted (255 = ignore) | rows:959/1024 | [inverted:] a file or folder
+    depth: str = "auto"  # auto: depth maps that the format names, or in depths/ with depth.json | none
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
     test_every: int = 8  # k of split=every
     cache_bytes: int = 1 << 30  # memory for decoded images of all views
@@ -146,6 +163,8 @@ class DataSettings:
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
             raise DataError(f"unknown data.split {self.split!r}; known: {', '.join(SPLITS)}")
+        if self.depth not in ("auto", "none"):
+            raise DataError(f"unknown data.depth {self.depth!r}; known: auto, none")
         if self.test_every < 2:
             raise DataError(
                 f"data.test_every is {self.test_every}; every k-th view is a test view, k must be 2 or more"

@@ -1,7 +1,7 @@
 """Diagnostics of the stability protocol: depth errors, floaters, dependence on yaw, and the pole gap.
 
-Depths are distances from the camera, [H, W] in world units; the true depth of the sky is infinite and not measured. All
-means are over the sphere: each row has the weight of its solid angle.
+Depths are distances from the camera, [H, W] in world units; true depths of 0 (unknown) or infinity (sky) are not
+measured. All means are over the sphere: each row has the weight of its solid angle.
 
 The pole gap is the WS-PSNR of rows within 30 degrees of the horizon minus that of rows beyond 75 degrees, in dB. If the
 scene has more detail at the horizon, it is negative for a method that treats all directions equally. It is therefore
@@ -32,6 +32,19 @@ SHARPEST = 0.05  # standard deviation of the finest blur in pixels of the horizo
 COARSEST = 1.0  # radian; nearly a single colour
 HALVINGS = 10  # bisection steps of the logarithm of the blur: to less than a percent
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # from ring to ring
+
+
+def depth_scores(view: View, rendering: Rendering, mask: Tensor | None = None) -> dict[str, float | None]:
+    """Return AbsRel and delta < 1.25 of the rendered depth, by solid angle; None without depth maps."""
+    if view.load_depth is None:
+        return {"abs_rel": None, "delta_1_25": None}
+    depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
+    if mask is not None:
+        truth = torch.where(mask > 0, truth, 0)
+    return {
+        "abs_rel": finite_or_none(depth_error(depth, truth)),
+        "delta_1_25": finite_or_none(depth_within(depth, truth)),
+    }
 
 
 def depth_error(depth: Tensor, truth: Tensor) -> Tensor:
@@ -101,9 +114,9 @@ def diagnose(render: Callable[[View], Rendering], view: View, rendering: Renderi
 
 
 def _mean(values: Tensor, truth: Tensor) -> Tensor:
-    """Return the mean over directions with finite true depth; NaN if there are none."""
+    """Return the mean over directions with known, finite true depth; NaN if there are none."""
     rows = solid_angle_weight(len(truth), dtype=values.dtype, device=values.device)[:, None]
-    weight = rows * torch.isfinite(truth)
+    weight = rows * (torch.isfinite(truth) & (truth > 0))
     return (torch.where(weight > 0, values, 0) * weight).sum() / weight.sum()
 
 

@@ -10,7 +10,7 @@ from statistics import median
 from typing import Any
 
 from padgs.clock import timed
-from padgs.evaluation.diagnostics import diagnose, oracle, pole_gap
+from padgs.evaluation.diagnostics import depth_scores, diagnose, oracle, pole_gap
 from padgs.evaluation.evaluate import Metrics, OnView, cropped_mask, evaluate, finite_or_none, quantized
 from padgs.evaluation.metrics import mean_color, psnr, ws_psnr_fitted
 from padgs.evaluation.protocols import Protocol
@@ -34,9 +34,17 @@ def score(
         on_view = None if scores else save_image
         if name == STABILITY:
             scores[name] = _stability(render, scene, protocol, on_view)
+        elif protocol.solid_angle and any(view.load_depth for view in scene.test):
+            scores[name] = evaluate(render, scene.test, protocol, on_view=on_view, extra=partial(_depth, protocol))
         else:
             scores[name] = evaluate(render, scene.test, protocol, on_view=on_view)
     return scores
+
+
+def _depth(protocol: Protocol, view: View, rendering: Rendering) -> Metrics:
+    """Return the scores of depth where the protocol and the view's mask count."""
+    mask = cropped_mask(view.mask(device=rendering.image.device), rendering.image, protocol)
+    return depth_scores(view, rendering, mask)
 
 
 def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:

@@ -283,7 +283,7 @@ def scene_choices() -> dict[str, dict[str, Any]]:
     {'defaults': [{'override /data': 'synthetic'}], 'data': {'generator': {'scene': 'outdoor'}}}
     """
     values = {f"synthetic_{scene}": ("synthetic", {"generator": {"scene": scene}}) for scene in SCENES} | {
-        f"{name}_{scene}": (name, {"path": f"data/{known.folder}/{scene}"})
+        f"{name}_{scene}": (name, {"path": f"data/{known.folder}/{known.place(scene)}"})
         for name, known in DATASETS.items()
         for scene in known.scenes
     }

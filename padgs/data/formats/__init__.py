@@ -15,6 +15,8 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("roam360", ("pose_c2w.json",)),
     ("ricoh360", ("output_dir/colmap/images.txt",)),
     ("released", ("data_extrinsics.json", "data_views.json")),
+    ("ob3d", ("cameras/*_cam.json",)),
+    ("tartanair", ("poses.txt", "scene.json")),
     ("colmap", ()),
     ("omniblender", ("transform.json",)),
     ("transforms", ("transforms.json",)),
@@ -61,6 +63,7 @@ def detect(path: Path) -> tuple[str, str]:
             f"{path} has no known format; it holds {inside or 'nothing'}. Known: a COLMAP model (sparse/0), "
             "transforms.json, sfm_data.json, reconstruction.json, cameras.xml (Metashape), pano-poses.csv (NavVis), "
             "an .e57 file, pose_c2w.json (360Roam), output_dir/colmap (Ricoh360), transform.json (OmniBlender), "
+            "cameras/*_cam.json (OB3D), poses.txt with scene.json (TartanAir-V2), "
             "data_views.json with data_extrinsics.json. Panoramas without poses: run `padgs prepare IMAGES OUT` first"
         )
     name, *others = found

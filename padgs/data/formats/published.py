@@ -1,4 +1,4 @@
-"""Readers of published data sets: 360Roam, Ricoh360 and OmniBlender.
+"""Readers of published data sets: 360Roam, Ricoh360, OmniBlender, OB3D and TartanAir-V2.
 
 360Roam: images/, `pose_c2w.json` (world from camera, OpenCV axes; includes the split) and scene.ply. Images of
 6080 x 3040 are reduced to the paper's 2048 x 1024 unless data.width is set; the bottom rows (tripod) are masked.
@@ -8,21 +8,37 @@ with a camera unknown to COLMAP, so they are parsed here. Their names may differ
 
 OmniBlender (EgoNeRF): `transform.json`, images/, train.txt, test.txt; no points. Poses are world from camera, with
 OpenGL axes, in Blender's z-up world.
+
+OB3D: a folder of one scene and trajectory (Egocentric or Non-Egocentric) with cameras/NNNNN_cam.json (cam from world,
+OpenCV axes), images/NNNNN_rgb.png, depths/NNNNN_depth.exr (Blender's depth pass, which is the distance along the ray of
+a panoramic camera), sparse/sparse.ply, and the numbers of the views in train.txt and test.txt.
+
+TartanAir-V2, the panoramas of COLMAP's benchmark: images/, depth/ (steps of 1/8 metre along the ray, the least of 4x4
+pixels, 0 = unknown), and poses.txt with a line "frame x y z qx qy qz qw" each: world (x north, y east, z down) from a
+body that looks along x. The middle of a panorama shows the left of the body. There are no points and no split.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame
+from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, Frame, listed
 from padgs.data.cloud import first_ply
 from padgs.data.datasets import DATASETS
 from padgs.data.formats.colmap import pose_of
 from padgs.data.formats.colmap_files import read_images, read_points
 from padgs.data.formats.json_file import Json, file_in, read_json
-from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose
-from padgs.data.splits import check_name
+from padgs.data.formats.poses import (
+    cam_from_opengl_pose,
+    cam_from_pose,
+    cam_from_world,
+    rigid,
+    rotation_from_quaternion,
+)
+from padgs.data.splits import LISTS, check_name, read_lines
 
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
@@ -84,3 +100,63 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
         pose = cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
     return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, _OMNIBLENDER_CLOUDS))
+
+
+def read_ob3d(path: Path, options: DataOptions) -> Capture:
+    """Read the cameras, depth maps and lists of one trajectory of an OB3D scene."""
+    images = image_folder(path, options.images)
+    frames: dict[str, Frame] = {}  # by number
+    for file in sorted((path / "cameras").glob("*_cam.json")):
+        (camera,) = one if len(one := read_json(file).entries()) == 1 else (None,)
+        if camera is None:
+            raise DataError(f"{file} must hold a list of one camera; copy it again")
+        number = file.name.removesuffix("_cam.json")
+        pose = camera["extrinsics"]
+        depth = path / "depths" / f"{number}_depth.exr"
+        frames[number] = Frame(
+            f"{number}_rgb.png",
+            images / f"{number}_rgb.png",
+            cam_from_world(pose["rotation"].numbers(3, 3), pose["translation"].numbers(3), str(file)),
+            camera["width"].whole(),
+            camera["height"].whole(),
+            depth=depth if depth.parent.is_dir() else None,
+        )
+    if not frames:
+        raise DataError(f"{path / 'cameras'} holds no NNNNN_cam.json; give the folder Egocentric or Non-Egocentric")
+    split = {}
+    for side, name in LISTS.items():
+        if (path / name).is_file():
+            lines = [line.strip() for line in read_lines(path / name) if line.strip()]
+            numbers = [line.removesuffix("_rgb.png").zfill(5) for line in lines]
+            if absent := [number for number in numbers if number not in frames]:
+                raise DataError(f"{path / name} names {listed(absent)}, which have no camera; copy the data set again")
+            split[side] = tuple(frames[number].name for number in numbers)
+    depth, cloud = DepthMeaning("ray", 1.0, "OB3D"), first_ply(path, ("sparse/sparse.ply",))
+    name = "_".join(path.absolute().parts[-2:])
+    return Capture("ob3d", path, images, tuple(frames.values()), cloud, split or None, depth=depth, name=name)
+
+
+# Body axes (x ahead, y right, z down) of the camera's x, y and z: the panoramas are turned by 90 degrees.
+_BODY_FROM_CAMERA = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+
+
+def read_tartanair(path: Path, options: DataOptions) -> Capture:
+    """Read poses and depth maps of a scene of TartanAir-V2, as COLMAP packs it."""
+    images, file = image_folder(path, options.images), path / "poses.txt"
+    frames = []
+    for index, line in enumerate(read_lines(file), start=1):
+        where = f"line {index} of {file}"
+        try:
+            frame, *numbers = line.split()
+            name, values = f"{int(frame):06d}", torch.tensor(list(map(float, numbers)), dtype=torch.float64)
+        except ValueError as error:
+            raise DataError(f"{where} is {line[:60]!r}; it must be: frame x y z qx qy qz qw") from error
+        if len(values) != 7:
+            raise DataError(f"{where} has {len(values)} numbers after the frame; it must have 7: x y z qx qy qz qw")
+        body = rotation_from_quaternion(values[[6, 3, 4, 5]], where)
+        pose = cam_from_pose(rigid(body @ _BODY_FROM_CAMERA, values[:3]), where)
+        depth = path / "depth" / f"{name}.png"
+        image = next((images / f"{name}{end}" for end in (".jpg", ".png") if (images / f"{name}{end}").is_file()), None)
+        image = image or images / f"{name}.jpg"
+        frames.append(Frame(image.name, image, pose, depth=depth if depth.parent.is_dir() else None))
+    return Capture("tartanair", path, images, tuple(frames), None, depth=DepthMeaning("ray", 1 / 8, "TartanAir-V2"))

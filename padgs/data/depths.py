@@ -1,0 +1,191 @@
+"""Depth maps of views: NPY, EXR and 16-bit PNG files, read as distance along the ray in world units.
+
+0 and NaN are unknown, infinity is sky. A format states what its files hold; a `depths/` folder of your own states it in
+`depth.json`, as `padgs render --depth` writes it: {"measure": "ray" or "z", "unit": world units of one step}.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from padgs.checks import install_command
+from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, listed
+from padgs.data.images import read_bytes
+from padgs.files import DAMAGE, open_image
+from padgs.scene import View
+
+FOLDERS = ("depths", "depth")
+STATEMENT = "depth.json"
+EXTENSIONS = (".npy", ".exr", ".png")
+MEASURES = ("ray", "z")
+SKY = 1e9  # steps; Blender writes 1e10 where there is nothing
+HOW = (
+    'write {"measure": "ray", "unit": 1} into it: ray is the distance along the ray, z that along the axis of the '
+    "camera, unit the world units of one step; or set data.depth=none"
+)
+
+
+@dataclass(frozen=True)
+class Depth:
+    """The depth map of one view; used as `View.load_depth`."""
+
+    file: Path
+    meaning: DepthMeaning
+    view: View
+    values: NDArray[np.float32] | None = None  # of the file, if they are held in memory
+
+    def __call__(self) -> Tensor:
+        """Return the distance along the ray [H, W] in world units; 0 is unknown, infinity sky. Nearest samples."""
+        height, width = self.view.height, self.view.width
+        values = read_depth(self.file) if self.values is None else self.values
+        rows, columns = ((np.arange(n) + 0.5) * size / n for n, size in zip((height, width), values.shape, strict=True))
+        steps = torch.from_numpy(values[rows.astype(int)[:, None], columns.astype(int)])
+        depth = torch.where(steps >= SKY, math.inf, steps.nan_to_num(0, posinf=math.inf).clamp(min=0))
+        depth = depth * self.meaning.unit
+        if self.meaning.measure == "z":
+            ahead = self.view.camera.rays()[..., 2]
+            depth = torch.where(ahead > 0, depth / ahead.clamp(min=1e-6), 0)
+        return depth
+
+
+def with_depths(
+    views: Sequence[View], capture: Capture, options: DataOptions
+) -> tuple[list[View], list[str], list[str]]:
+    """Return the views of the capture's frames with `load_depth`, digests of the files, and notes.
+
+    Maps are held in memory if all fit into `cache_bytes`; else they are read on each access.
+
+    Raises:
+        DataError: files of unknown meaning, damaged, of another shape than a view, or without a known distance.
+    """
+    files, meaning = ({}, None) if options.depth == "none" else _depth_files(capture)
+    if meaning is None:
+        return list(views), [], []
+    made, digests, sizes, total = [], [f"{meaning.measure}{meaning.unit}"], set(), 0
+    for view, frame in zip(views, capture.frames, strict=True):
+        if (file := files.get(frame.name)) is None:
+            made.append(view)
+            continue
+        if meaning.measure == "z" and view.lens is None:
+            raise DataError(
+                f"{file} holds z (by {meaning.source}), but {frame.name} is a panorama, which has no such axis; "
+                "convert it to the distance along the ray, or set data.depth=none"
+            )
+        values = read_depth(file)
+        height, width = values.shape
+        if width * view.height != height * view.width:
+            raise DataError(
+                f"{file} is {width}x{height}, and {frame.name} is {view.width}x{view.height}; a depth map must have "
+                "the shape of its image, in any size"
+            )
+        if not (np.isfinite(values) & (values > 0) & (values < SKY)).any():
+            raise DataError(f"{file} holds no distance above 0; remove it, or set data.depth=none")
+        sizes.add(f"{width}x{height}")
+        digests.append(f"{frame.name}:{hashlib.sha256(read_bytes(file)).hexdigest()}")
+        total += values.nbytes
+        made.append(
+            replace(view, load_depth=Depth(file, meaning, view, values if total <= options.cache_bytes else None))
+        )
+    note = f"depth: {len(files)} of {len(views)} views, {listed(sorted(sizes))}, {meaning}"
+    return made, digests, [note]
+
+
+def read_depth(file: Path) -> NDArray[np.float32]:
+    """Read the numbers of a depth map, [H, W].
+
+    Raises:
+        DataError: unreadable, damaged, 8-bit, of several channels that differ, or EXR without OpenEXR.
+    """
+    data = read_bytes(file)
+    try:
+        if file.suffix.lower() == ".npy":
+            values = np.load(BytesIO(data), allow_pickle=False)
+        elif file.suffix.lower() == ".exr":
+            values = _exr(file)
+        else:
+            image = open_image(BytesIO(data), file)
+            if not image.mode.startswith("I"):
+                raise DataError(f"{file} has pixels of type {image.mode}; a depth map needs 16 bits, in one channel")
+            values = np.asarray(image)
+    except DAMAGE as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{file} is cut short or damaged ({error}); copy it again or remove it") from error
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
+        raise DataError(
+            f"{file} is an array of {values.dtype} {list(values.shape)}; it must be [height, width] numbers"
+        )
+    return values.astype(np.float32)
+
+
+def _exr(file: Path) -> NDArray:
+    """Read the single channel of an EXR file, or one of three that are equal, as Blender writes depth."""
+    try:
+        import OpenEXR  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise DataError(f"{file}: reading EXR needs OpenEXR: {install_command('exr')}") from error
+    try:
+        channels = OpenEXR.File(str(file), separate_channels=True).channels()
+        pixels = {name: np.asarray(channel.pixels) for name, channel in channels.items() if name != "A"}
+    except RuntimeError as error:
+        raise DataError(f"{file} is no usable EXR file ({error}); export it again") from error
+    first, *others = pixels.values()
+    if not all(np.array_equal(first, other, equal_nan=True) for other in others):
+        raise DataError(f"{file} holds the channels {listed(pixels)}, which differ; a depth map has one")
+    return first
+
+
+def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None]:
+    """Return the depth files by frame, as the format names them or from a `depths/` folder, and what they hold."""
+    if capture.depth is not None:
+        named = {frame.name: frame.depth for frame in capture.frames if frame.depth is not None}
+        if absent := [path for path in named.values() if not path.is_file()]:
+            raise DataError(
+                f"{len(absent)} depth maps of {capture.format} do not exist ({listed(absent)}); copy them, or set "
+                "data.depth=none"
+            )
+        return named, capture.depth if named else None
+    for folder in dict.fromkeys(
+        base / name for base in (capture.folder, capture.image_folder.parent) for name in FOLDERS
+    ):
+        there = {
+            path.relative_to(folder).with_suffix("").as_posix(): path
+            for path in sorted(folder.rglob("*"))
+            if path.suffix.lower() in EXTENSIONS and path.is_file()
+        }
+        stems = {frame.name: frame.name.rpartition(".")[0] for frame in capture.frames}
+        files = {
+            name: there[key]
+            for name, stem in stems.items()
+            if (key := next((key for key in (stem, f"{stem}_depth") if key in there), None)) is not None
+        }
+        if files:
+            return files, _stated(folder / STATEMENT, any(path.suffix.lower() == ".png" for path in files.values()))
+    return {}, None
+
+
+def _stated(file: Path, is_png: bool) -> DepthMeaning:
+    """Read what the maps of a folder hold; the steps of integers have no usual unit."""
+    if not file.is_file():
+        raise DataError(f"{file.parent} holds depth maps, but there is no {file.name} that says what they hold; {HOW}")
+    try:
+        stated = json.loads(read_bytes(file))
+        measure, unit = stated["measure"], stated["unit"] if is_png else stated.get("unit", 1)
+        if measure not in MEASURES or isinstance(unit, bool) or not 0 < float(unit) < math.inf:
+            raise ValueError(f"measure is {measure!r} and unit {unit!r}")
+    except (ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
+        raise DataError(f"{file} does not say what the depth maps hold ({error}); {HOW}") from error
+    return DepthMeaning(measure, float(unit), file.name)

@@ -1,0 +1,220 @@
+"""Depth maps: stand-ins for OB3D and TartanAir-V2 in their exact layout, folders of one's own, and their scores."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from support.fixtures import HALF, World, write_cloud, write_colmap_text
+
+from padgs.checks import lookup
+from padgs.data import DATASETS, DataError, load
+from padgs.evaluation.protocols import protocol_from_options
+from padgs.evaluation.scoring import score
+from padgs.geometry.panorama import rays
+from padgs.render import Rendering
+
+LEFT_AHEAD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # body from camera, as COLMAP's benchmark states it
+
+
+def truth(world: World, i: int) -> torch.Tensor:
+    """Return the distance [H, W] float64 from a camera to the box."""
+    width, height = world.size
+    directions = rays(width, height, dtype=torch.float64) @ torch.from_numpy(world.rotations[i])
+    center = torch.from_numpy(world.centers[i])
+    return ((directions.sign() * torch.from_numpy(HALF) - center) / directions).amin(-1)
+
+
+def write_ob3d(world: World, folder: Path, depths: bool) -> None:
+    for name in ("cameras", "images", "sparse", *(["depths"] if depths else [])):
+        (folder / name).mkdir(parents=True)
+    write_cloud(world, folder / "sparse" / "sparse.ply")
+    width, height = world.size
+    for i, image in enumerate(world.images):
+        Image.fromarray(image).save(folder / "images" / f"{i:05d}_rgb.png")
+        pose = {"rotation": world.rotations[i].tolist(), "translation": world.translations[i].tolist()}
+        lens = {"focal": height, "cx": width / 2, "cy": height / 2}
+        camera = [{"id": i, "width": width, "height": height, "intrinsics": lens, "extrinsics": pose}]
+        (folder / "cameras" / f"{i:05d}_cam.json").write_text(json.dumps(camera))
+        if depths:
+            import OpenEXR
+
+            depth = truth(world, i).float().numpy()
+            depth[:2] = 1e10  # Blender's sky
+            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+            OpenEXR.File(header, {"RGB": np.stack([depth] * 3, -1)}).write(str(folder / f"depths/{i:05d}_depth.exr"))
+    (folder / "train.txt").write_text("0\n2\n3\n")
+    (folder / "test.txt").write_text("00004\n")
+
+
+@pytest.mark.parametrize("depths", [False, True])
+def test_ob3d(depths: bool, world: World, tmp_path: Path):
+    if depths and not find_spec("OpenEXR"):
+        write_colmap_text(world, tmp_path / "a")
+        (tmp_path / "a" / "depths").mkdir()
+        (tmp_path / "a" / "depths" / f"{world.names[0]}.exr").write_bytes(b"v/1\x01")
+        (tmp_path / "a" / "depths" / "depth.json").write_text('{"measure": "ray"}')
+        with pytest.raises(DataError, match=r"reading EXR needs OpenEXR: .*padgs\[exr\]"):
+            load(tmp_path / "a")
+        return
+    folder = tmp_path / "bistro" / "Non-Egocentric"
+    write_ob3d(world, folder, depths)
+    scene = load(folder)
+    assert scene.name == "bistro_Non-Egocentric" and scene.notes[0].startswith("format: ob3d, ")
+    assert [view.name for view in scene.train] == ["00000_rgb", "00002_rgb", "00003_rgb"]
+    assert [view.name for view in scene.test] == ["00004_rgb"] and len(scene.points) == len(world.points)
+    view = scene.test[0]
+    torch.testing.assert_close(view.center, torch.from_numpy(world.centers[4]), atol=1e-12, rtol=0)
+    assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[4]))
+    if depths:
+        depth = view.load_depth()
+        assert torch.isinf(depth[:2]).all() and torch.equal(depth[2:], truth(world, 4)[2:].float())
+        assert "depth: 6 of 6 views, 64x32, distance along the ray in steps of 1 world units (by OB3D)" in scene.notes
+    else:
+        assert view.load_depth is None
+    (folder / "train.txt").write_text("7\n")
+    with pytest.raises(DataError, match="train.txt names 00007, which have no camera"):
+        load(folder)
+
+
+def test_tartanair(world: World, tmp_path: Path):
+    folder, lines = tmp_path / "House-easy-P000", []
+    for name in ("images", "depth"):
+        (folder / name).mkdir(parents=True)
+    for i, image in enumerate(world.images):
+        Image.fromarray(image).save(folder / "images" / f"{i + 10:06d}.jpg", quality=97, subsampling=0)
+        least = -torch.nn.functional.max_pool2d(-truth(world, i)[None], 4)[0]
+        steps = (8 * least).round().numpy().astype(np.uint16)
+        steps[0] = 0
+        Image.fromarray(steps).save(folder / "depth" / f"{i + 10:06d}.png")
+        body = world.rotations[i].T @ LEFT_AHEAD.T
+        numbers = [*world.centers[i], *Rotation.from_matrix(body).as_quat()]
+        lines.append(" ".join([str(i + 10), *(repr(float(number)) for number in numbers)]))
+    (folder / "poses.txt").write_text("\n".join(lines) + "\n")
+    (folder / "scene.json").write_text("{}")
+    scene = load(folder)
+    assert scene.notes[0].startswith("format: tartanair, ") and [view.name for view in scene.test] == ["000010"]
+    for view in (*scene.test, *scene.train):
+        i = int(view.name) - 10
+        torch.testing.assert_close(view.cam_from_world[:3, :3], torch.from_numpy(world.rotations[i]), atol=1e-9, rtol=0)
+        torch.testing.assert_close(view.center, torch.from_numpy(world.centers[i]), atol=1e-9, rtol=0)
+        depth = view.load_depth()
+        assert not depth[:4].any() and depth.shape == (32, 64)
+        assert ((depth - truth(world, i))[4:] <= 1 / 16 + 1e-6).all()  # the least of 16 pixels, rounded
+    (folder / "poses.txt").write_text("10 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match="line 1 of .*poses.txt has 6 numbers after the frame; it must have 7"):
+        load(folder)
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.001])
+def test_a_folder_of_depths_states_what_it_holds(unit: float, world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    before = load(tmp_path).fingerprint
+    (tmp_path / "depths").mkdir()
+    for i, name in enumerate(world.names[:5]):  # one view has none
+        values = (truth(world, i) / unit).numpy()
+        if unit == 1:
+            np.save(tmp_path / "depths" / f"{name}.npy", values[::2, ::2])
+        else:
+            Image.fromarray(values.round().astype(np.uint16)).save(tmp_path / "depths" / f"{name}.png")
+    statement = {"measure": "ray", "unit": unit} if unit != 1 else {"measure": "ray"}
+    (tmp_path / "depths" / "depth.json").write_text(json.dumps(statement))
+    scene = load(tmp_path)
+    views = {view.name: view for view in (*scene.train, *scene.test)}
+    for i, name in enumerate(world.names[:5]):
+        expected = truth(world, i).float()
+        if unit == 1:  # nearest samples of half the size
+            expected = expected[::2, ::2].repeat_interleave(2, 0).repeat_interleave(2, 1)
+        torch.testing.assert_close(views[name].load_depth(), expected, atol=unit / 2 if unit != 1 else 0, rtol=1e-6)
+    assert views[world.names[5]].load_depth is None and scene.fingerprint != before
+    assert any(note.startswith("depth: 5 of 6 views") for note in scene.notes)
+    off, small = load(tmp_path, depth="none"), load(tmp_path, cache_bytes=0)
+    assert off.fingerprint == before and not any(view.load_depth for view in off.train)
+    assert torch.equal(small.train[0].load_depth(), scene.train[0].load_depth())  # read on each access
+
+
+@pytest.mark.parametrize(
+    ("statement", "values", "message"),
+    [
+        (None, np.ones((4, 8)), "holds depth maps, but there is no depth.json that says what they hold; write"),
+        ('{"measure": "z"}', np.ones((4, 8)), "holds z .* but pano_00.png is a panorama, which has no such axis"),
+        ('{"measure": "disparity"}', np.ones((4, 8)), "depth.json does not say .*'disparity'.*; write .*ray"),
+        ('{"measure": "ray", "unit": 0}', np.ones((4, 8)), "does not say what the depth maps hold .*unit 0"),
+        ('["ray"]', np.ones((4, 8)), "does not say what the depth maps hold"),
+        ('{"measure": "ray"}', np.ones((4, 4)), "is 4x4, and pano_00.png is 64x32; .* the shape of its image"),
+        ('{"measure": "ray"}', np.zeros((4, 8)), "holds no distance above 0"),
+        (
+            '{"measure": "ray"}',
+            np.ones((4, 8, 3)),
+            r"is an array of float64 \[4, 8, 3\]; it must",
+        ),
+        ('{"measure": "ray"}', b"\x93NUMPY", "is cut short or damaged"),
+    ],
+)
+def test_unknown_or_damaged_depths_are_refused(statement, values, message, world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    (tmp_path / "depths").mkdir()
+    file = tmp_path / "depths" / f"{world.names[0]}.npy"
+    if isinstance(values, bytes):
+        file.write_bytes(values)
+    else:
+        np.save(file, values)
+    if statement:
+        (tmp_path / "depths" / "depth.json").write_text(statement)
+    with pytest.raises(DataError, match=message):
+        load(tmp_path)
+
+
+def test_an_image_of_depth_is_no_depth_map(world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    (tmp_path / "depths").mkdir()
+    Image.new("L", world.size, 9).save(tmp_path / "depths" / f"{world.names[0]}.png")
+    (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray", "unit": 0.1}')
+    with pytest.raises(DataError, match="has pixels of type L; a depth map needs 16 bits"):
+        load(tmp_path)
+    (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray"}')
+    with pytest.raises(DataError, match="does not say what the depth maps hold .*'unit'"):
+        load(tmp_path)
+
+
+def test_depth_is_scored_where_it_is_known(world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    (tmp_path / "depths").mkdir()
+    (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray"}')
+    known = truth(world, 1).numpy()
+    known[:16], known[20] = 0, np.inf  # unknown, and sky
+    np.save(tmp_path / "depths" / f"{world.names[1]}.npy", known)  # of the first of two test views
+    scene = load(tmp_path)
+
+    def render(view) -> Rendering:
+        depth = (1.1 * truth(world, world.names.index(view.name))).float()
+        depth[:16] = 50
+        depth[28:] *= 2
+        return Rendering(view.image(), torch.zeros(32, 64), depth, torch.ones(1, dtype=torch.bool))
+
+    protocols = {name: protocol_from_options(name, lpips="none") for name in ("paper", "sphere")}
+    scores = score(render, scene, protocols, None)
+    area = torch.cos((torch.arange(32) + 0.5 - 16) / 32 * torch.pi)
+    area[:16] = area[20] = 0
+    share = (area[28:].sum() / area.sum()).item()
+    assert "abs_rel" not in scores["paper"].metrics
+    assert scores["sphere"].metrics["abs_rel"] == pytest.approx(0.1 * (1 - share) + 1.2 * share, rel=1e-4)
+    assert scores["sphere"].metrics["delta_1_25"] == pytest.approx(1 - share, rel=1e-4)
+    assert scores["sphere"].views[world.names[4]]["abs_rel"] is None
+
+
+def test_data_sets_of_nested_folders_are_named(tmp_path: Path):
+    assert [len(DATASETS[name].scenes) for name in ("ob3d", "tartanair")] == [24, 100]
+    for name, scene in (("ob3d", "bistro/Egocentric"), ("tartanair", "urban/HongKong-hard-P004")):
+        with pytest.raises(
+            DataError, match=f"{DATASETS[name].title} is missing. Get it from https.* put it into .*{name},"
+        ):
+            load(tmp_path / name / scene)
+    (tmp_path / "ob3d").mkdir()
+    with pytest.raises(DataError, match="the scene 'bistro_Egocentric' of OB3D is missing"):
+        load(tmp_path / "ob3d" / "bistro" / "Egocentric")
+    assert lookup({"a": "padgs.data.formats.published:read_ob3d"}, "a", "x")
