@@ -38,7 +38,13 @@ from padgs.reports.specs import PREPARE, SPECS, TITLES
 from padgs.reports.table import Block, Cell, Column, Row, Table
 
 PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers add
-IF_KNOWN = ("cpu_seconds", "peak_gpu_gigabytes")  # no column if no run has a number
+IF_KNOWN = (
+    "cpu_seconds",
+    "peak_gpu_gigabytes",
+    "sphere/abs_rel",
+    "sphere/delta_1_25",
+)  # no column if no run has a number
+SEEN_NOTE = "Tuned on: settings of methods were chosen on the scene; never seen: nobody had trained on it then."
 RATES = {"published": "published rates", "run": "rates for the run"}
 
 
@@ -87,15 +93,19 @@ class _Builder:
                     blocks += self._scenes_down(dataset, done)
         if self.spec.averages:
             others = [place for place in self._places() if not place.apart and place.dataset not in self.spec.paper]
-            try:
-                blocks += self._average("", others, len(others))
-            except Mixture as mixture:  # each scene has a block of its own all the same
-                notes.append(f"No mean over the scenes: {mixture.what}.")
+            for kind in dict.fromkeys(place.seen for place in others):
+                alike = [place for place in others if place.seen == kind]
+                try:
+                    blocks += self._average("", alike, len(alike))
+                except Mixture as mixture:  # each scene has a block of its own all the same
+                    notes.append(f"No mean over the scenes{f' {kind}' if kind else ''}: {mixture.what}.")
         notes += footnotes(self.shown, *self.protocols)
         if self.paper:
             delta = any(measure.difference for measure in self.measures)
             words = "; Δ = ours - paper, at the size and length of the paper only" if delta else ""
             notes.append(f"'paper': published numbers, from one RTX 3090 Ti{words}.")
+        if any(place.seen for place in self._places()):
+            notes.append(SEEN_NOTE)
         notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference]), *self.spec.notes]
         return Table(self.name, self.spec.title, self.spec.corner, self._columns(), (*blocks, *single), tuple(notes))
 
@@ -209,7 +219,8 @@ class _Builder:
             return []
         runs = self.runs.loc[self.runs["place"].isin(places)]
         words = f"{len(places)} of its {count} scenes" if len(places) < count else f"its {count} scenes"
-        heading = f"{title}, average over {words}" if title else f"Average over {count} scenes"
+        kind = f" {places[0].seen}" if places[0].seen else ""
+        heading = f"{title}, average over {words}" if title else f"Average over {count} scenes{kind}"
         if not title or len(places) < count:
             heading += f": {', '.join(place.label for place in places)}"
         refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.shared if of != "data"])

@@ -17,7 +17,7 @@ from padgs.reports import REPORTS, methods, published
 from padgs.reports.conditions import as_published, refuse_mixture
 from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
-from padgs.reports.published import DATASETS, Key, Place, Published
+from padgs.reports.published import DATASETS, NEVER_SEEN, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import CONFIDENCE
 from padgs.reports.table import MISSING
@@ -214,7 +214,7 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
     """Return a row for each scene (and value of `within`): the advantage of the means over seeds over the best rival's.
 
     Of the sizes and lengths that both sides have, those with `LEAST_SEEDS` of both count first, then the widest, then
-    the longest.
+    the longest. Scenes that were never seen decide alone, where there are any.
     """
     runs = run_set.of_experiments(*claim.experiments)
     if claim.scenes:
@@ -230,7 +230,8 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         refuse_mixture(alike, run_set.request, where, ("protocol",))
         if row := _beside_best(claim, one_setting(ours.select(alike), where), others.select(alike)):
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
-            row |= {"scene": found["place"].label, "size": size, "length": length, "width": int(size.partition("x")[0])}
+            row |= {"scene": found["place"].label, "seen": found["place"].seen}
+            row |= {"size": size, "length": length, "width": int(size.partition("x")[0])}
             row["iterations"] = alike["iterations"].max()
             row["as published"] = as_published(alike)
             key = tuple(found[name] for name in ("place", *claim.within))
@@ -241,6 +242,8 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         by_scene = rows.groupby("scene", sort=False)
         means = {"advantage": by_scene["advantage"].mean(), "tested": by_scene["tested"].all()}
         rows = by_scene.first().assign(**means).reset_index()
+    if len(rows) and (never := rows["tested"] & (rows["seen"] == NEVER_SEEN)).any():
+        rows["tested"] = never
     return rows
 
 

@@ -74,6 +74,8 @@ def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
     for block, runs in blocks.items():
         titles.setdefault(_sentence(runs, protocols), []).append(block)
     notes = [f"{'; '.join(of)}: {sentence}" for sentence, of in titles.items()]
+    made = {(of, by) for own in blocks.values() for of, by in zip(own["preset"], own["external"], strict=True) if by}
+    notes += [f"{title(of)}: made by {by}, and only scored by padgs." for of, by in sorted(made)]
     for method, length in PUBLISHED_LENGTHS.items():
         if any(((runs["method"] == method) & (runs["iterations"] < length)).any() for runs in blocks.values()):
             notes.append(f"{name(method)} is published with {length} iterations.")

@@ -18,12 +18,14 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.checks import printable
+from padgs.reports.methods import EXTERNAL
 from padgs.reports.published import Place
 from padgs.reports.store import Run
 from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, picture_name
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
+ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
 LINEAR, LINEAR_ITERATIONS = ("omnigs", "op43dgs"), 3000  # methods with a law of their own for learning rates
@@ -54,7 +56,7 @@ def row_of(run: Run) -> tuple[dict[str, Any], ...]:
 
 def _cleaned(result: Result) -> Result:
     """Return a result whose texts are one line without control characters, as every report shows them."""
-    names = ("run", "variant", "scene", "code_version", "machine", "config", "finished")
+    names = ("run", "variant", "scene", "code_version", "machine", "config", "finished", "external")
     scores = {
         name: replace(of, protocol=_one_line(of.protocol), metrics=_one_line(of.metrics))
         for name, of in result.scores.items()
@@ -86,6 +88,7 @@ def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
     """Return title -> runs of one scene that agree in some columns, in the order of the tables."""
     found = {}
     for place, own in by_place(runs).items():
+        own = own.fillna({"length": ELSEWHERE})
         for values, alike in grouped(own.sort_values(["resolution", "iterations"], kind="stable"), *columns):
             found[", ".join([place.title, *values])] = alike
     return found
@@ -114,7 +117,9 @@ def images_seen(result: Result) -> float | None:
     """
     options, share = result.config.get("method", {}), 1.0
     coarse = options.get("coarse_share", 0.0) if result.width >= 2 * LEAST_WIDTH else 0.0
-    if result.method == "egonerf":
+    if result.external:
+        share = None
+    elif result.method == "egonerf":
         share = options["rays"] / (result.width * result.height) if "rays" in options else None
     elif coarse:
         counted = not result.ended and "seconds" not in result.config.get("budget", {})
@@ -247,15 +252,17 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     **{
         name: attrgetter(name)
         for name in (
-            *("run", "ok", "status", "method", "preset", "variant", "dataset", "scene", "seed", "iterations"),
+            *("run", "ok", "status", "method", "variant", "dataset", "scene", "seed", "iterations"),
             *("code_version", "finished"),
         )
     },
+    "preset": lambda result: f"{EXTERNAL}{result.external['label']}" if result.external else result.preset,
+    "external": lambda result: " ".join(filter(None, map(result.external.get, ("program", "version")))) or None,
     "experiments": lambda result: result.experiments or (AD_HOC,),
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],
-    "length": _length,
+    "length": lambda result: None if result.external else _length(result),
     "learning_rates": _learning_rates,
     "hardware": _hardware,
     "machine": _machine,
@@ -266,7 +273,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "view_psnr": lambda result: _view_psnr(result.scores),
 }
 NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
-    "iterations_done": lambda result: result.iterations_done,
+    "iterations_done": lambda result: None if result.external else result.iterations_done,
     "images": images_seen,
     "rate_factor": _factor,
     "train_seconds": _training_seconds,

@@ -18,6 +18,8 @@ PROTOCOL_METRICS = {  # protocol -> its counterpart of each of PAPER_METRICS
 }
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws": "WS", "vgg": "VGG", "alex": "Alex", "01": "[0, 1]"}
 
+DEPTH = {"abs_rel": Column("depth AbsRel", 3, False), "delta_1_25": Column("depth δ < 1.25", 3, True)}
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -63,6 +65,8 @@ def metric(protocol: str, name: str, group: str = "", **changes: Any) -> Measure
     >>> metric("sphere", "ws_psnr_pole").column.heading, metric("paper", "lpips_vgg_01").column.heading
     ('WS-PSNR pole ↑', 'LPIPS VGG [0, 1] ↓')
     """
+    if name in DEPTH:
+        return Measure(f"{protocol}/{name}", replace(DEPTH[name], group=group, **changes))
     title = " ".join(TITLES.get(word, word) for word in name.split("_")).replace("WS ", "WS-")
     column = Column(title, 2 if "psnr" in name else 3, higher_is_better(name), group=group)
     return Measure(f"{protocol}/{name}", replace(column, **changes))

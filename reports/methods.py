@@ -2,13 +2,51 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import yaml
 
+from padgs.checks import printable
+
 METHODS = yaml.safe_load(Path(__file__).with_name("methods.yaml").read_text("utf-8"))
 STATUS = {preset: words for method in METHODS.values() for preset, words in method.get("presets", {}).items()}
+
+
+COLOR = re.compile("#[0-9a-fA-F]{6}")
+EXTERNAL = "external: "  # presets of models and renders that another program made begin with it; their label follows
+
+
+@cache
+def outside(group: str, name: str, attribute: str) -> str:
+    """Return a text attribute of what another package offers by an entry point; empty where it says none.
+
+    Args:
+        group: padgs.methods (classes) or padgs.datasets.
+        name: of the method or data set.
+        attribute: title or color (#rrggbb).
+    """
+    for point in entry_points(group=group, name=name):
+        try:
+            value = getattr(point.load(), attribute, "")
+        except Exception:  # of a package that does not work; a run that needs it says so
+            return ""
+        if isinstance(value, str) and (attribute != "color" or COLOR.fullmatch(value)):
+            return printable(value, kept="")
+    return ""
+
+
+@cache
+def _others() -> tuple[str, ...]:
+    return tuple(point.name for point in entry_points(group="padgs.methods"))
+
+
+def color(method: str) -> str:
+    """Return the colour of a method as #rrggbb; empty if it has none."""
+    return METHODS[method]["color"] if method in METHODS else outside("padgs.methods", method, "color")
 
 
 def method_of(preset: str) -> str:
@@ -17,13 +55,15 @@ def method_of(preset: str) -> str:
     >>> method_of("odgs_release"), method_of("padgs_plus"), method_of("my_own")
     ('odgs', 'padgs_plus', 'my_own')
     """
-    known = [method for method in METHODS if preset == method or preset.startswith(f"{method}_")]
+    known = [method for method in (*METHODS, *_others()) if preset == method or preset.startswith(f"{method}_")]
     return max(known, key=len, default=preset)
 
 
 def name(method: str) -> str:
-    """Return the authors' name of a method, or else its name in the configuration."""
-    return METHODS[method]["title"] if method in METHODS else method
+    """Return the authors' name of a method, or else its name in the configuration; labels of other programs' models."""
+    if method.startswith(EXTERNAL):
+        return f"{method.removeprefix(EXTERNAL)} (external)"
+    return METHODS[method]["title"] if method in METHODS else outside("padgs.methods", method, "title") or method
 
 
 def title(preset: str) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 FILE = Path(__file__).resolve().parent.parent / "baselines" / "published.csv"  # in a checkout and when installed
 PROTOCOL = "paper"  # the only protocol under which ours may stand beside published numbers
 DATASETS = {"roam360": "360roam", "ricoh360": "ricoh360"}  # our names -> names in the file
@@ -14,6 +16,12 @@ TITLES = {"roam360": "360Roam", "ricoh360": "Ricoh360"}
 SCENES = {"center_1": "center1"}  # names in the file -> names of the folders, where they differ
 AVERAGE = "average"
 BUILT_IN = "synthetic"  # data set of the generated scenes; their names begin with it
+NEVER_SEEN, TUNED_ON = "never seen", "tuned on"
+SEEN = {  # scene -> NEVER_SEEN or TUNED_ON
+    scene: kind.replace("_", " ")
+    for kind, scenes in yaml.safe_load((FILE.parent.parent / "conf" / "tuned_on.yaml").read_text("utf-8")).items()
+    for scene in scenes
+}
 OUTDOOR_WORDS = ("outdoor", "garden")  # in names of scenes outside the data sets that belong to Table 2
 
 
@@ -70,10 +78,19 @@ class Place:
 
     @property
     def title(self) -> str:
-        """Title with the data set."""
-        if self.published or not self.dataset:
-            return self.heading
-        return f"{self.label} ({'generated' if self.dataset == BUILT_IN else self.dataset})"
+        """Title with the data set, and whether the methods' settings were chosen on the scene."""
+        origin = "" if self.published else "generated" if self.dataset == BUILT_IN else self.dataset
+        words = ", ".join(filter(None, (origin, self.seen)))
+        return f"{self.heading} ({words})" if words else self.heading
+
+    @property
+    def seen(self) -> str:
+        """Whether settings of methods were chosen on the scene: NEVER_SEEN or TUNED_ON; empty where nothing is known.
+
+        >>> Place("", "flat").seen, Place("", "plaza").seen, Place("", "my_house").seen
+        ('tuned on', 'never seen', '')
+        """
+        return SEEN.get(self.scene, "") if self.dataset in ("", BUILT_IN) else ""
 
     @property
     def stem(self) -> str:
@@ -86,10 +103,11 @@ class Place:
         return self.label if self.dataset == implied else f"{self.label}_{self.dataset or 'capture'}"
 
     @property
-    def rank(self) -> tuple[int, str, str, str]:
-        """Sort key: scenes of the paper first, then by name."""
-        order = list(DATASETS)
-        return (order.index(self.dataset) if self.published else len(order), self.dataset, self.scene, self.apart)
+    def rank(self) -> tuple[int, int, str, str, str]:
+        """Sort key: scenes of the paper first, then those never seen, then by name, and those tuned on last."""
+        order, seen = list(DATASETS), (NEVER_SEEN, "", TUNED_ON).index(self.seen)
+        first = order.index(self.dataset) if self.published else len(order)
+        return first, seen, self.dataset, self.scene, self.apart
 
 
 def load() -> Mapping[Key, Published]:

@@ -106,7 +106,7 @@ class RunSet:
 
     def chosen(self, name: str) -> DataFrame:
         """Return the runs for a report: of the requested experiment, else scene by scene of the report's own
-        experiments, else ad hoc runs, else all.
+        experiments, else ad hoc runs, else all; models of other programs always.
 
         A folder may hold sweeps and trials, which would otherwise compete for the cells of the table.
         """
@@ -114,7 +114,9 @@ class RunSet:
         if self.request.experiment:
             return runs
         own = self.of_experiments(*REPORTS[name].experiments)
-        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(lambda of: AD_HOC in of))]
+        external = runs["preset"].str.startswith(methods.EXTERNAL)
+        ad_hoc = runs["experiments"].map(lambda of: AD_HOC in of)
+        free = runs.loc[~runs.index.isin(own.index) & ad_hoc & (external | ~runs["place"].isin(own["place"]))]
         return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
 
     def of_experiments(self, *names: str) -> DataFrame:

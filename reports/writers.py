@@ -22,7 +22,7 @@ SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasc
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
 SPECIAL |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"}
 SPECIAL |= {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
-SPECIAL |= {"†": r"\dag{}", "τ": r"$\tau$", "√": r"$\surd$"}
+SPECIAL |= {"†": r"\dag{}", "τ": r"$\tau$", "δ": r"$\delta$", "√": r"$\surd$"}
 LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}
 MARKDOWN_MARKS = {None: "{}", BEST: "**{}**"}
 MARKDOWN_SPECIAL = re.compile(r"[\\`*_\[\]|~$#<]|&(?=[#\w])|:(?=//)|(?<=www)\.")

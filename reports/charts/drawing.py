@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from padgs.reports.methods import METHODS, method_of
+from padgs.reports.methods import METHODS, color, method_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -135,9 +135,9 @@ def show_image(panel: Any, image: Any, title: str) -> None:
 
 def color_of(preset: str, presets: Sequence[str]) -> str:
     """Return the colour of a preset's method; methods without one get theirs by their order in `presets`."""
-    if method_of(preset) in METHODS:
-        return METHODS[method_of(preset)]["color"]
-    others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in METHODS]
+    if own := color(method_of(preset)):
+        return own
+    others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if not color(name)]
     return OTHERS[others.index(method_of(preset)) % len(OTHERS)]
 
 

@@ -66,7 +66,7 @@ class TradeOff:
     @property
     def on_cpu(self) -> bool:
         """True if CPU time is shown, which other programs disturb less: all runs have it, and none used a GPU."""
-        own = self.runs.loc[self.runs["ok"]]
+        own = self.runs.loc[self.runs["ok"] & ~self.runs["preset"].str.startswith(methods.EXTERNAL)]
         return bool(own["cpu_seconds"].notna().all() and own["peak_gpu_gigabytes"].isna().all())
 
     @cached_property

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 from omegaconf import OmegaConf
-from support.made_up import RULES, builder, compared, failed, of_experiment, result, run_set, small
+from support.made_up import RULES, builder, compared, external, failed, of_experiment, result, run_set, small
 
 from padgs.baselines import BUILT_IN, METHODS
 from padgs.checks import lookup
@@ -396,3 +396,44 @@ def test_rows_of_runs_name_preset_and_changed_keys_and_none_is_the_best():
     (block,) = runs(run_set(swept)).blocks
     assert [row.title for row in block.rows] == ["padgs, tau 0.5, seed 0, 0.5", "padgs, tau 0.9, seed 0, 0.9"]
     assert len(runs(run_set(swept, where={"method.tau": "0.5"})).blocks[0].rows) == 1
+
+
+def test_models_of_other_programs_have_rows_beside_the_methods():
+    made = run_set([*compared([ROOM], seeds=3), external(27.5, "my|splat"), external(20.0, "renders")])
+    for build in (methods, table1):
+        (block,) = build(made).blocks
+        assert [row.title for row in block.rows][-2:] == ["my|splat (external)", "renders (external)"]
+    assert value(methods(made), ROOM, "my|splat (external)", "WS-PSNR") == pytest.approx(27.1)
+    assert value(methods(made), ROOM, "my|splat (external)", "iterations") is None
+    text = markdown(methods(made))
+    assert "my\\|splat (external): made by Brush 0.3, and only scored by padgs." in text and "Not ranked" not in text
+    assert [block.title for block in runs(made).blocks][0] == f"{ROOM} (generated), 512x256, made elsewhere"
+
+
+def test_depth_has_columns_where_a_run_was_scored_by_it_and_is_chosen_by_name():
+    one = small(25.0)
+    sphere = replace(
+        one.scores["sphere"], metrics={**one.scores["sphere"].metrics, "abs_rel": 0.05, "delta_1_25": 0.98}
+    )
+    deep = run_set([replace(one, scores={**one.scores, "sphere": sphere})])
+    assert value(methods(deep), ROOM, "PaD-GS", "depth AbsRel") == 0.05
+    assert not any("depth" in title for title in columns(methods(run_set([one]))))
+    chosen = table1(run_set([replace(one, scores={"sphere": sphere})], protocol="sphere", metrics=("delta_1_25",)))
+    assert [column.heading for column in chosen.columns] == ["depth δ < 1.25 ↑"]
+
+
+def test_scenes_tuned_on_and_never_seen_stand_apart():
+    scenes = {"room": "", "flat": "", "plaza": "", "basement": "", "my_house": ""}
+    made = [small(25.0 + n, scene=scene, dataset=of, run=scene) for n, (scene, of) in enumerate(scenes.items())]
+    table = methods(run_set(made))
+    assert [block.title for block in table.blocks] == [
+        "Average over 2 scenes never seen: basement, plaza",
+        "Average over 2 scenes tuned on: flat, room",
+        "basement (never seen)",
+        "plaza (never seen)",
+        "my_house",
+        "flat (tuned on)",
+        "room (tuned on)",
+    ]
+    assert "nobody had trained on it" in "".join(table.notes)
+    assert "tuned" not in markdown(methods(run_set(made[-1:])))
