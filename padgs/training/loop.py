@@ -17,6 +17,7 @@ from padgs.training.health import EarlyStopping, Failure, Monitor, out_of_memory
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget, TrainOptions
+from padgs.training.outliers import Outliers
 from padgs.training.schedule import Pace
 from padgs.training.targets import TrainingViews
 
@@ -82,6 +83,8 @@ class Trainer:
                 "beside images/, or set 0"
             )
         self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=uses_depth)
+        ratio = options.outlier_ratio
+        self._outliers = None if ratio is None else Outliers(scene.train, self._views.targets, ratio)
         self._order: Any = self._views  # its state decides which data the next iterations see
         pixels = sum(view.width * view.height for view in scene.train)
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
@@ -149,6 +152,8 @@ class Trainer:
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
+                if self._outliers is not None:
+                    target = self._outliers.weighted(index, view, rendered.rendering, target, step / self.schedule)
                 loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))

@@ -168,8 +168,8 @@ class TrainingViews:
     ) -> None:
         """Shuffle the views, except those `held_out` until `include_held_out`; other arguments as in `Targets`."""
         self._scene, self._held_out = scene, tuple(held_out)
-        self._targets = Targets(scene.train, weight, device, coarse_share, depth=depth)
-        self.halvings = self._targets.halvings
+        self.targets = Targets(scene.train, weight, device, coarse_share, depth=depth)
+        self.halvings = self.targets.halvings
         self._generator = torch.Generator().manual_seed(seed)
         self._order = self._shuffled()  # of this epoch
         self._position = 0
@@ -180,7 +180,7 @@ class TrainingViews:
         # At the end of an epoch the next order is unknown, and the present view is prefetched.
         upcoming = int(self._order[min(self._position, len(self._order) - 1)])
         self._scene.train[upcoming].prefetch()
-        return index, *self._targets.at(index, progress)
+        return index, *self.targets.at(index, progress)
 
     def next_index(self) -> int:
         """Return the index of the next view."""
