@@ -76,13 +76,8 @@ class Trainer:
         self._optimizer = Optimizer(groups, options.check_every, **self.ADAM)
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out, device = self._early_stopping.held_out, self._optimizer.device
-        uses_depth, self._unit = options.depth_weight > 0, scene.scale
-        if uses_depth and not any(view.load_depth for view in scene.train):
-            raise ValueError(
-                f"train.depth_weight is {options.depth_weight}, but no training view has a depth map; put depths/ "
-                "beside images/, or set 0"
-            )
-        self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=uses_depth)
+        self._unit, depth = scene.scale, options.depth_weight > 0
+        self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=depth)
         ratio = options.outlier_ratio
         self._outliers = None if ratio is None else Outliers(scene.train, self._views.targets, ratio)
         self._order: Any = self._views  # its state decides which data the next iterations see

@@ -93,7 +93,7 @@ class TrainOptions:
     # measured: in world units, also for initial points. monocular: inverse ranges up to a scale and a shift of each
     # view, which are fitted to each render.
     depth_kind: str = "measured"
-    # Pixels with an error of more than so many times that of nearby views at the same place weigh less, as passers-by do;
+    # Pixels with an error above so many times that of nearby views at the same place weigh less, such as passers-by;
     # null: all pixels count. See `padgs.training.outliers`.
     outlier_ratio: float | None = None
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth

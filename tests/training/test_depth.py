@@ -84,7 +84,7 @@ def test_small_views_have_small_depth_maps():
 
 def test_missing_and_wrong_depth_maps_are_refused():
     scene, options = tiny_scene(), TrainOptions(depth_weight=0.1)
-    with pytest.raises(ValueError, match="train.depth_weight is 0.1, but no training view has a depth map"):
+    with pytest.raises(ValueError, match="train.depth_weight is not 0, but no training view has a depth map"):
         next(PlusMethod(train=options).fit(scene, Budget(5)))
     wrong = replace(scene, train=tuple(replace(v, load_depth=lambda: torch.ones(4, 8)) for v in scene.train))
     with pytest.raises(ValueError, match=f"depth map of view '.*' is 8x4; the view is {WIDTH}x{HEIGHT}"):
