@@ -59,7 +59,7 @@ class Targets:
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`; `depth`: use depth maps."""
         if depth and not any(view.load_depth for view in views):
             raise ValueError(
-                "train.depth_weight is not 0, but no training view has a depth map; put depths/ beside images/, or set 0"
+                "train.depth_weight is not 0, but no training view has a depth map; put depths/ beside images/"
             )
         self._weight, self._device, self._coarse_share, self._depth = weight, device, coarse_share, depth
         self._weights: dict[tuple[int, int], Tensor] = {}  # by the number of halvings and the index of the view
