@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 SECONDS_BETWEEN_QUERIES = 10.0
+TOO_MANY = re.compile(
+    r"array|limit", re.IGNORECASE
+)  # of MaxArraySize, a QOS or an account
+
+
+class SubmissionRefused(Exception):
+    """Slurm takes none of these jobs; `too_many` if it may take fewer."""
+
+    @property
+    def too_many(self) -> bool:
+        """True if there is a limit on the number of jobs."""
+        return TOO_MANY.search(str(self)) is not None
 
 
 def wait_for_jobs(jobs: Sequence[Any], stop_requested: Callable[[], bool]) -> list[int]:

@@ -50,7 +50,7 @@ from padgs.multirun.job import (
     job_of_many,
 )
 from padgs.multirun.overrides import expand
-from padgs.multirun.slurm import wait_for_jobs
+from padgs.multirun.slurm import SubmissionRefused, wait_for_jobs
 from padgs.results import Result, ResultError
 from padgs.runs.config import RunOptions
 from padgs.runs.console import Display, compact, duration, psnr_of, say, write
@@ -139,6 +139,11 @@ class Multirun:
             error = self._launch(launcher, [self.jobs[index] for index in batch], launched)
             launched += len(batch)
             self._follow(batch)
+            if isinstance(error, SubmissionRefused):
+                waiting, batch_size = batch + waiting, len(batch) // 2 if error.too_many else 0
+                while not batch_size and waiting:
+                    self._end(waiting.pop(0), JobState(REFUSED, reason=str(error)))
+                continue
             if self.board.stop_requested():
                 raise Interrupted("stopped, running jobs wrote their checkpoints")
             left = [index for index in batch if not self.states[index].ended]
@@ -316,7 +321,11 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
     executor.update_parameters(**{key if key in common else f"{cluster}_{key}": parameters[key] for key in parameters})
     ids = (f"job_id_for_{first_number + position}" for position in range(len(jobs)))
     state, key = repeat(Singleton.get_state(), len(jobs)), repeat("hydra.sweep.dir", len(jobs))
-    submitted = executor.map_array(launcher, jobs, key, range(first_number, first_number + len(jobs)), ids, state)
+    numbers = range(first_number, first_number + len(jobs))
+    try:
+        submitted = executor.map_array(launcher, jobs, key, numbers, ids, state)
+    except submitit.core.utils.FailedJobError as error:
+        raise SubmissionRefused(f"Slurm takes no job: {error}") from error
     if cluster == "slurm":
         for position in wait_for_jobs(submitted, board.stop_requested):
             board.write(first_number + position, JobState(STOPPED, reason="it left the queue of Slurm before it began"))
