@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 SECONDS_BETWEEN_QUERIES = 10.0
-TOO_MANY = re.compile(
-    r"array|limit", re.IGNORECASE
-)  # of MaxArraySize, a QOS or an account
+TOO_MANY = re.compile(r"array|limit", re.IGNORECASE)  # of MaxArraySize, a QOS or an account
 
 
 class SubmissionRefused(Exception):

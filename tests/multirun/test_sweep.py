@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
@@ -12,8 +13,9 @@ from rich.console import Console
 from support import made_up
 
 from padgs import results
-from padgs.multirun import sweep
+from padgs.multirun import slurm, sweep
 from padgs.multirun.job import Board, JobState
+from padgs.multirun.slurm import SubmissionRefused
 from padgs.multirun.sweep import Multirun
 from padgs.runs.interrupt import Interrupted
 
@@ -107,6 +109,35 @@ class InArrays(Start):
 
 def test_jobs_are_launched_in_batches(tmp_path):
     assert InArrays(tmp_path, 1, ELSEWHERE).counts(2) == {"ok": 3}
+
+
+class Refusing(Start):
+    def launch(self, jobs, initial_job_idx):
+        if len(jobs) > 1 or self.reason == "invalid partition":
+            raise SubmissionRefused(self.reason)
+        super().launch(jobs, initial_job_idx)
+
+
+@pytest.mark.parametrize(
+    ("reason", "counts"),
+    [("Invalid job array specification", {"ok": 3}), ("invalid partition", {"refused": 3})],
+)
+def test_arrays_that_slurm_refuses_are_submitted_in_parts_if_that_may_help(tmp_path, capsys, reason, counts):
+    start = Refusing(tmp_path, 1, ELSEWHERE)
+    start.reason = reason
+    assert start.counts() == counts and (reason in capsys.readouterr().err) == ("refused" in counts)
+
+
+def test_slurm_jobs_are_followed_until_the_queue_has_none_of_them(tmp_path, monkeypatch):
+    answers = [None, {"7_0", "7_1", "8"}, {"7_1"}, {"8"}]  # 8 is of somebody else; Slurm does not answer at first
+    monkeypatch.setattr(slurm, "queued", lambda: answers.pop(0))
+    monkeypatch.setattr(slurm, "SECONDS_BETWEEN_QUERIES", 0.0)
+    cancelled = []
+    monkeypatch.setattr(slurm, "cancel_pending", lambda ids: cancelled.extend(ids) or True)
+    (tmp_path / "0").touch()
+    jobs = [SimpleNamespace(job_id=f"7_{n}", paths=SimpleNamespace(stdout=tmp_path / str(n))) for n in range(2)]
+    assert slurm.wait_for_jobs(jobs, lambda: len(answers) < 3) == [1], "the second left no output"
+    assert not answers and cancelled == ["7_0", "7_1"], "asked once to take waiting jobs out of the queue"
 
 
 class OneFails(Start):
