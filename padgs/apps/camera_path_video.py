@@ -7,13 +7,14 @@ because the index (`moov`) is the last box.
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from uuid import UUID
 
 import numpy as np
@@ -25,16 +26,17 @@ from torch import Tensor
 from padgs.checks import install_command
 from padgs.data.camera_paths import PATHS, gravity
 from padgs.data.capture import DataError
+from padgs.data.depths import STATEMENT
 from padgs.data.formats.path_file import read_path
 from padgs.data.formats.transforms import transforms_file
 from padgs.evaluation.images import depth_image, to_uint8
-from padgs.files import atomic_path, draft_of
-from padgs.geometry.camera import Camera, Panorama, perspective
+from padgs.files import atomic_path, draft_of, write_atomically
+from padgs.geometry.camera import Camera, Panorama, Pinhole, perspective
 from padgs.render import Rendering
 from padgs.runs.load import LoadedRun
 from padgs.scene import View, move_origin
 
-WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16
+WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16 or float32
 DEPTH_STEPS = 1000  # of 16-bit depth, per scene scale
 # Stated explicitly: by default, players take large videos to be BT.709, and small ones to be BT.601.
 COLOURS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
@@ -95,6 +97,8 @@ def write_video(
     fps: float,
     scene_scale: float,
     depth: bool = False,
+    npy: bool = False,
+    origin: Tensor | None = None,
     spherical: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Path]:
@@ -106,7 +110,10 @@ def write_video(
         render: renders a view.
         fps: frames per second of an .mp4.
         scene_scale: unit of depths.
-        depth: also write depth: as colours in an .mp4 (bright is near), as 16 bits in PNGs (`DEPTH_STEPS` per scale).
+        depth: also write depth: as colours in an .mp4 (bright is near); beside PNGs as distances along the rays, with
+            `depth.json`: unit, camera and pose of each frame in the world of the data set.
+        npy: distances as float32 in world units, not as 16 bits (`DEPTH_STEPS` per scale).
+        origin: that of the scene's coordinates in the world of the data set.
         spherical: mark an .mp4 as a panorama.
         progress: called with the number of written frames.
 
@@ -120,40 +127,59 @@ def write_video(
     is_mp4 = to.suffix.lower() == ".mp4"
     if to.suffix and not is_mp4 and not to.is_dir():
         raise ValueError(f"{to} is not an .mp4, the only video format; a folder for PNGs must have no suffix")
+    if npy and (is_mp4 or not depth):
+        raise ValueError("--npy is about depth in numbers: add --depth and --to FOLDER")
     outputs = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
+    unit = 1.0 if npy else scene_scale / DEPTH_STEPS
     with ExitStack() as stack:
         if is_mp4:
             writers = [stack.enter_context(_mp4(path, views[0], fps, spherical)) for path in outputs]
         else:
-            texts = ("", depth_unit(to, scene_scale))
-            writers = [stack.enter_context(_png_folder(*each)) for each in zip(outputs, texts, strict=False)]
+            texts = ("", depth_unit(to, scene_scale, npy=npy))
+            writers = [stack.enter_context(_folder(*each)) for each in zip(outputs, texts, strict=False)]
         for number, view in enumerate(views):
             rendering = render(view)
             writers[0](to_uint8(rendering.image))
             if depth:
-                writers[1](
-                    depth_image(rendering, scene_scale) if is_mp4 else _sixteen_bit(rendering.depth / scene_scale)
-                )
+                steps = rendering.depth if npy or is_mp4 else (rendering.depth / unit).round().clamp(0, 2**16 - 1)
+                numbers = steps.cpu().numpy().astype(np.float32 if npy else np.uint16)
+                writers[1](depth_image(rendering, scene_scale) if is_mp4 else numbers)
             progress(number + 1)
+    if depth and not is_mp4:
+        statement = {"measure": "ray", "unit": unit, "frames": _frames(views, origin)}
+        write_atomically(outputs[1] / STATEMENT, json.dumps(statement, indent=1).encode())
     return outputs
 
 
-def depth_unit(to: Path, scene_scale: float) -> str:
+def depth_unit(to: Path, scene_scale: float, *, npy: bool = False) -> str:
     """Return what the values of written depths mean; PNGs hold it as their description."""
     if to.suffix.lower() == ".mp4":
         return "depth: bright is near, black is empty; a folder of PNGs holds it in numbers"
+    if npy:
+        return "depth: float32, world units of the data set along the ray; 0 is empty; cameras in depth.json"
     unit = scene_scale / DEPTH_STEPS
-    return f"depth: one step is {unit:.6g} world units of the data set; 0 is empty, 65535 is {65535 * unit:.6g} or more"
+    return (
+        f"depth: one step is {unit:.6g} world units of the data set along the ray; 0 is empty, 65535 is "
+        f"{65535 * unit:.6g} or more; cameras in depth.json"
+    )
 
 
-def _sixteen_bit(depth: Tensor) -> np.ndarray:
-    return (depth * DEPTH_STEPS).round().clamp(0, 2**16 - 1).cpu().numpy().astype(np.uint16)
+def _frames(views: Sequence[View], origin: Tensor | None) -> dict[str, Any]:
+    """Return camera and pose of each frame in the world of the data set."""
+    frames: dict[str, Any] = {}
+    for number, view in enumerate(views, start=1):
+        lens, pose = view.camera, view.cam_from_world.double().cpu()
+        kind = {"model": type(lens).__name__.lower()}
+        numbers = vars(lens) if isinstance(lens, Panorama | Pinhole) else {"width": lens.width, "height": lens.height}
+        pose = pose if origin is None else move_origin(pose, -origin.cpu())
+        frames[f"{number:05d}"] = {"camera": kind | numbers, "cam_from_world": pose.tolist()}
+    return frames
 
 
 @contextmanager
-def _png_folder(path: Path, description: str) -> Iterator[WriteFrame]:
+def _folder(path: Path, description: str) -> Iterator[WriteFrame]:
     path.mkdir(parents=True, exist_ok=True)
-    if stale := next(path.glob("*.png"), None):
+    if stale := next((file for file in path.iterdir() if file.suffix in (".png", ".npy")), None):
         raise ValueError(f"{path} already holds images, such as {stale.name}; choose another folder with --to")
     numbers, info = iter(range(1, 1 << 30)), PngInfo()
     if description:
@@ -162,7 +188,10 @@ def _png_folder(path: Path, description: str) -> Iterator[WriteFrame]:
         draft.mkdir()
 
         def write(frame: np.ndarray) -> None:
-            Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png", pnginfo=info)
+            if frame.dtype == np.float32:
+                np.save(draft / f"{next(numbers):05d}.npy", frame)
+            else:
+                Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png", pnginfo=info)
 
         yield write
         for image in sorted(draft.iterdir()):

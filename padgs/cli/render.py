@@ -24,6 +24,7 @@ def render(
     seconds: Annotated[float | None, typer.Option(help="length; default 10, or that of the camera path")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
     depth: Annotated[bool, typer.Option("--depth", help="also write depth")] = False,
+    npy: Annotated[bool, typer.Option("--npy", help="depth as float32 .npy, beside the PNGs of --to FOLDER")] = False,
     data: DataPath = None,
 ) -> None:
     """Write a video (or PNGs) along a path, as panoramas, which players recognise, or in perspective."""
@@ -61,10 +62,12 @@ def render(
                 fps=fps,
                 scene_scale=found.scene.scale,
                 depth=depth,
+                npy=npy,
+                origin=found.scene.origin,
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),
             )
     for written in outputs:
         show(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")
     if depth:
-        show(f"  {depth_unit(output, found.scene.scale)}")
+        show(f"  {depth_unit(output, found.scene.scale, npy=npy)}")

@@ -1,5 +1,6 @@
 """Camera-path videos: encoding, spherical metadata, and `padgs render`."""
 
+import json
 import struct
 from types import SimpleNamespace
 
@@ -10,8 +11,9 @@ from PIL import Image
 from support.tiny_run import tiny_run
 from typer.testing import CliRunner
 
-from padgs.apps.camera_path_video import write_video
+from padgs.apps.camera_path_video import views_along, write_video
 from padgs.cli.commands import app
+from padgs.data.depths import read_depth
 from padgs.runs.load import load_run
 from padgs.scene import View
 
@@ -120,11 +122,29 @@ def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
     assert depth.dtype == np.uint16 and depth.min() > 0
     unit = load_run(folder).scene.scale / 1000
     assert f"one step is {unit:.6g} world units" in Image.open(tmp_path / "q-depth" / "00001.png").text["Description"]
+    frame = json.loads((tmp_path / "q-depth" / "depth.json").read_text())["frames"]["00001"]
+    assert frame["camera"] | {"fx": 0, "fy": 0} == dict(model="pinhole", width=8, height=4, fx=0, fy=0, cx=4, cy=2)
+    pose = views_along(load_run(folder), "dolly", 0.1, 20)[0].cam_from_world
+    np.testing.assert_allclose(frame["cam_from_world"], pose.numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("npy", [False, True])
+def test_written_depths_can_be_read_as_depth_maps(npy, tmp_path):
+    depth = 5 * torch.rand(32, 64)
+    shown = SimpleNamespace(image=SHOWN.image, depth=depth)
+    origin, options = torch.tensor([10.0, 0.0, 0.0]), {"fps": 10, "scene_scale": 2.5, "depth": True, "npy": npy}
+    write_video(tmp_path / "a", [VIEW], lambda view: shown, origin=origin, **options)
+    stated = json.loads((tmp_path / "a-depth" / "depth.json").read_text())
+    assert stated["measure"] == "ray" and stated["unit"] == (1 if npy else 0.0025)
+    assert np.linalg.inv(stated["frames"]["00001"]["cam_from_world"])[:3, 3].tolist() == [10, 0, 0]
+    found = read_depth(next((tmp_path / "a-depth").glob("00001.*"))) * stated["unit"]
+    np.testing.assert_allclose(found, depth, atol=0 if npy else 0.00126)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("--npy",), "--npy is about depth in numbers: add --depth and --to FOLDER"),
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
         *((("--fps", value), f"--fps is {float(value)}; it must be from 0.01 to 1000") for value in BAD_NUMBERS),
         *((("--seconds", value), f"--seconds is {float(value):g}, which makes") for value in BAD_NUMBERS),
