@@ -19,8 +19,10 @@ from padgs.data.formats.convert import convert
 from padgs.scene import Scene
 
 
-@pytest.mark.parametrize("to", [to for to in writers.WRITERS if to != "nerfstudio"])
-@pytest.mark.parametrize("source", WRITERS)
+@pytest.mark.parametrize(
+    ("source", "to"),
+    [*((source, "released") for source in WRITERS), *(("colmap", to) for to in writers.WRITERS if to != "nerfstudio")],
+)
 def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
     """Convert a data set written by hand, and compare both as loaded."""
     WRITERS[source](world, tmp_path / "in")
