@@ -55,6 +55,8 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
         DataError: laspy or a decoder of LAZ is missing, or the file is damaged.
     """
     laspy = optional_module("laspy", path)
+    if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
+        optional_module("lazrs", path)
     with _readable(path, "export it again as LAS 1.2 to 1.4"), laspy.open(path) as file:
         step = -(-file.header.point_count // MOST_POINTS) or 1
         coloured = set(CHANNELS) <= set(file.header.point_format.dimension_names)
@@ -73,8 +75,6 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
 
 def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:
     """Read the points of all scans of an E57 file in the file's common frame, and notes.
-
-    Colours are scaled by the range that the file states for their type.
 
     Raises:
         DataError: pye57 is missing, or the file is damaged.
@@ -105,19 +105,17 @@ def open_e57(path: Path) -> Iterator[Any]:
 
 def _scan(file: Any, header: Any, step: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Return every `step`-th valid point [P, 3] of a scan in the file's frame, and its colours [P, 3]."""
-    fields, spherical = set(header.point_fields), "cartesianX" not in header.point_fields
-    axes = [f"cartesian{axis}" for axis in "XYZ"]
-    if spherical:
-        axes = [f"spherical{name}" for name in ("Range", "Azimuth", "Elevation")]
+    lib, fields = import_module("pye57").libe57, set(header.point_fields)
+    spherical = "cartesianX" not in fields
+    axes = [f"spherical{name}" for name in ("Range", "Azimuth", "Elevation")]
+    axes = axes if spherical else [f"cartesian{axis}" for axis in "XYZ"]
     paint = [f"color{name.title()}" for name in CHANNELS]
     coloured = set(paint) <= fields
     invalid = [name for name in ("cartesianInvalidState", "sphericalInvalidState") if name in fields]
-    columns, buffers = {}, file.make_buffers([], 0)[1]
+    columns, buffers = {}, lib.VectorSourceDestBuffer()
     for name in [*axes, *(paint if coloured else []), *invalid]:
         columns[name] = np.empty(CHUNK, np.float64)
-        buffers.append(
-            import_module("pye57").libe57.SourceDestBuffer(file.image_file, name, columns[name], CHUNK, True, True)
-        )
+        buffers.append(lib.SourceDestBuffer(file.image_file, name, columns[name], CHUNK, True, True))
     reader, points, colors, start = header.points.reader(buffers), [np.zeros((0, 3))], [np.zeros((0, 3))], 0
     while count := reader.read():
         some = np.arange(-start % step, count, step)
@@ -136,17 +134,11 @@ def _scan(file: Any, header: Any, step: int) -> tuple[np.ndarray, np.ndarray | N
         found = file.to_global(found, header.rotation, header.translation)
     if not coloured:
         return found, None
-    kinds = import_module("pye57").libe57.StructureNode(header.points.prototype())
-    types = [_integer_type(kinds[name]) for name in paint]
-    values = np.concatenate(colors)
-    return found, color_bytes(values.astype(types[0]) if types[0] else values, f"scan {header.guid}").numpy()
-
-
-def _integer_type(node: Any) -> type | None:
-    """Return the smallest NumPy type that holds a whole colour of an E57 file; None for floats."""
-    if type(node).__name__ != "IntegerNode":
-        return None
-    return next((kind for kind in (np.uint8, np.uint16) if node.maximum() <= np.iinfo(kind).max), np.uint32)
+    values, kind = np.concatenate(colors), lib.StructureNode(header.points.prototype())[paint[0]]
+    if isinstance(kind, lib.IntegerNode):
+        fits = (whole for whole in (np.uint8, np.uint16) if kind.maximum() <= np.iinfo(whole).max)
+        values = values.astype(next(fits, np.uint32))
+    return found, color_bytes(values, f"scan {header.guid}").numpy()
 
 
 def _thinned(path: Path, points: np.ndarray, colors: Any, step: int) -> tuple[Cloud, tuple[str, ...]]:
