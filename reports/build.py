@@ -29,6 +29,7 @@ from padgs.reports.selection import Mixture, RunSet, experiment_of, one_setting,
 from padgs.reports.significance import (
     SEEDS,
     mean_cell,
+    numbers_of,
     over_scenes,
     over_seeds,
     places,
@@ -273,10 +274,13 @@ class _Builder:
         return tuple(Row(title, (ranks.get(i, Cell()), *row)) for i, (title, row) in enumerate(found))
 
     def _each_run(self, runs: DataFrame) -> Iterator[Row]:
+        ok = numbers_of(runs, self.measures)
+        numbers = dict(zip(ok.index, ok.to_numpy().tolist(), strict=True))
         for one in settings(runs):
-            for index, seed, run in one.runs[["seed", "run"]].itertuples():
+            for index, seed, run, status in one.runs[["seed", "run", "status"]].itertuples():
                 title = ", ".join([one.preset, *one.apart, f"seed {seed}", run.rpartition("_")[2]])
-                yield Row(title, tuple(over_seeds(runs.loc[[index]], self.measures)))
+                failed, values = ("", numbers[index]) if index in numbers else (status, [math.nan] * len(self.measures))
+                yield Row(title, tuple(mean_cell([] if math.isnan(value) else [value], failed) for value in values))
 
 
 class _Pivot(_Builder):

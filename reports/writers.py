@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pandas import DataFrame
+from PIL import Image
 
 from padgs.files import write_atomically
 from padgs.reports.charts.drawing import Chart
@@ -54,7 +55,7 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
     elif isinstance(made, Chart):
         name = _short(file_name(made.name))
         yield f"{name}.png", made.png
-        if svg:
+        if svg and not isinstance(made.figure, Image.Image):
             yield f"{name}.svg", made.svg.encode()
         if made.numbers is not None:
             yield f"{name}.csv", made.numbers.to_csv(index=False, lineterminator="\n").encode()

@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pandas import DataFrame
+from PIL import Image
 
 from padgs.reports.methods import METHODS, color, method_of
 
@@ -70,7 +71,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Chart:
-    """A drawn figure, its notes, and its numbers for a CSV file."""
+    """A drawn figure or image, its notes, and its numbers for a CSV file."""
 
     name: str  # file name without extension
     title: str
@@ -82,6 +83,9 @@ class Chart:
     def png(self) -> bytes:
         """The figure on white paper."""
         data = io.BytesIO()
+        if isinstance(self.figure, Image.Image):
+            self.figure.save(data, "PNG")
+            return data.getvalue()
         self.figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
         return data.getvalue()
 
@@ -120,10 +124,15 @@ def figure(columns: int, rows: int, width: float = 3.0, height: float = 2.6) -> 
 def lay_out(made: Any, title: str) -> None:
     """Write the title and fix the layout, so that later additions can refer to positions in the figure."""
     size = TITLE_SIZE if made.get_figwidth() > NARROW else SMALL_TITLE_SIZE
-    letters = int(LETTERS * made.get_figwidth() / size)
-    made.suptitle("\n".join(part for line in title.split("\n") for part in wrap(line, letters)), fontsize=size)
-    made.draw_without_rendering()
+    made.suptitle(wrap_title(title, int(LETTERS * made.get_figwidth() / size)), fontsize=size)
+    if engine := made.get_layout_engine():
+        engine.execute(made)
     made.set_layout_engine("none")
+
+
+def wrap_title(title: str, letters: int) -> str:
+    """Return a title in lines of at most so many letters."""
+    return "\n".join(part for line in title.split("\n") for part in wrap(line, letters))
 
 
 def show_image(panel: Any, image: Any, title: str) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pandas import DataFrame
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from padgs.reports import methods
-from padgs.reports.charts.drawing import Chart, figure, lay_out, show_image, styled
+from padgs.reports.charts.drawing import INK, PAPER, Chart, wrap_title
 from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet
@@ -18,6 +18,8 @@ from padgs.reports.store import render_names, split_image
 from padgs.results import file_name
 
 COLUMNS = 3
+WIDTH, GAP, TITLE, FONT_SIZE, LETTER = 420, 12, 22, 14, 9  # pixels: of an image, between images, of lines and letters
+BOX = Image.Resampling.BOX
 
 
 def charts(run_set: RunSet) -> list[Chart]:
@@ -63,14 +65,20 @@ def stacked(images: Sequence[Image.Image]) -> Image.Image:
     return sheet
 
 
-@styled
 def _sheet(name: str, title: str, images: list[tuple[str, Image.Image]], notes: tuple[str, ...]) -> Chart:
-    made, axes = figure(COLUMNS, math.ceil(len(images) / COLUMNS), 3.9, 4.2)
-    for panel in axes.flat:
-        panel.set(xticks=[], yticks=[])  # hidden axes reserve space for their labels
-        panel.set_axis_off()
-        panel.set_anchor("N")
-    for panel, (words, image) in zip(axes.flat, images, strict=False):
-        show_image(panel, image, words)
-    lay_out(made, title)
-    return Chart(name, title, made, notes)
+    """Return images with titles. Pillow draws them ten times faster than axes of matplotlib."""
+    import matplotlib
+
+    font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", FONT_SIZE)
+    images = [(words, image.resize((WIDTH, round(WIDTH * image.height / image.width)), BOX)) for words, image in images]
+    columns, row = min(COLUMNS, len(images)), TITLE + GAP + max(image.height for _, image in images)
+    lines = wrap_title(title, columns * WIDTH // LETTER)
+    head = TITLE * (lines.count("\n") + 2)
+    sheet = Image.new("RGB", (columns * (WIDTH + GAP), head + row * math.ceil(len(images) / columns)), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((sheet.width / 2, TITLE / 2), lines, INK, font, anchor="ma", align="center")
+    for number, (words, image) in enumerate(images):
+        left, top = number % columns * (WIDTH + GAP) + GAP // 2, head + number // columns * row
+        draw.text((left + WIDTH / 2, top), words, INK, font, anchor="ma")
+        sheet.paste(image, (left, top + TITLE))
+    return Chart(name, title, sheet, notes)
