@@ -103,14 +103,9 @@ class Tracks:
 class DepthMeaning(NamedTuple):
     """Meaning of the numbers of depth maps; see `padgs.data.depths`."""
 
-    measure: str  # ray: distance along the ray; z: along the axis of the camera
+    measure: str  # a key of `padgs.data.depths.MEASURES`
     unit: float  # world units of one step
     source: str  # that states it
-
-    def __str__(self) -> str:
-        """Return the words for notes."""
-        what = "distance along the ray" if self.measure == "ray" else "z along the axis"
-        return f"{what} in steps of {self.unit:g} world units (by {self.source})"
 
 
 class Reading(NamedTuple):

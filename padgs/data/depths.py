@@ -1,7 +1,7 @@
 """Depth maps of views: NPY, EXR and 16-bit PNG files, read as distance along the ray in world units.
 
 0 and NaN are unknown, infinity is sky. A format states what its files hold; a `depths/` folder of your own states it in
-`depth.json`, as `padgs render --depth` writes it: {"measure": "ray" or "z", "unit": world units of one step}.
+`depth.json`, as `padgs render --depth` writes it: {"measure": a key of MEASURES, "unit": world units of one step}.
 """
 
 from __future__ import annotations
@@ -28,11 +28,18 @@ from padgs.scene import View
 FOLDERS = ("depths", "depth")
 STATEMENT = "depth.json"
 EXTENSIONS = (".npy", ".exr", ".png")
-MEASURES = ("ray", "z")
+MEASURES = {
+    "ray": "distance along the ray",
+    "z": "distance along the axis of the camera",
+    "relative": "distance along the ray up to scale and shift of its inverse",
+    "disparity": "inverse distance up to scale and shift",
+}
+RELATIVE = ("relative", "disparity")  # as of networks that see one image
 SKY = 1e9  # steps; Blender writes 1e10 where there is nothing
 HOW = (
     'write {"measure": "ray", "unit": 1} into it: ray is the distance along the ray, z that along the axis of the '
-    "camera, unit the world units of one step; or set data.depth=none"
+    "camera, relative and disparity (its inverse) what networks estimate from one image, unit the world units of one "
+    "step; or set data.depth=none"
 )
 
 
@@ -49,8 +56,12 @@ class Depth:
         """Return the distance along the ray [H, W] in world units; 0 is unknown, infinity sky. Nearest samples."""
         height, width = self.view.height, self.view.width
         values = read_depth(self.file) if self.values is None else self.values
-        rows, columns = ((np.arange(n) + 0.5) * size / n for n, size in zip((height, width), values.shape, strict=True))
-        steps = torch.from_numpy(values[rows.astype(int)[:, None], columns.astype(int)])
+        if values.shape != (height, width):
+            rows, columns = ((np.arange(n) + 0.5) * s / n for n, s in zip((height, width), values.shape, strict=True))
+            values = values[rows.astype(int)[:, None], columns.astype(int)]
+        steps = torch.from_numpy(values)
+        if self.meaning.measure == "disparity":
+            steps = torch.where(steps >= 0, 1 / steps, 0)
         depth = torch.where(steps >= SKY, math.inf, steps.nan_to_num(0, posinf=math.inf).clamp(min=0))
         depth = depth * self.meaning.unit
         if self.meaning.measure == "z":
@@ -94,10 +105,11 @@ def with_depths(
         sizes.add(f"{width}x{height}")
         digests.append(f"{frame.name}:{hashlib.sha256(read_bytes(file)).hexdigest()}")
         total += values.nbytes
-        made.append(
-            replace(view, load_depth=Depth(file, meaning, view, values if total <= options.cache_bytes else None))
-        )
-    note = f"depth: {len(files)} of {len(views)} views, {listed(sorted(sizes))}, {meaning}"
+        depth = Depth(file, meaning, view, values if total <= options.cache_bytes else None)
+        made.append(replace(view, load_depth=depth, depth_is_relative=meaning.measure in RELATIVE))
+    what = MEASURES[meaning.measure]
+    what += "" if meaning.measure in RELATIVE else f" in steps of {meaning.unit:g} world units"
+    note = f"depth: {len(files)} of {len(views)} views, {listed(sorted(sizes))}, {what} (by {meaning.source})"
     return made, digests, [note]
 
 
@@ -183,7 +195,8 @@ def _stated(file: Path, is_png: bool) -> DepthMeaning:
         raise DataError(f"{file.parent} holds depth maps, but there is no {file.name} that says what they hold; {HOW}")
     try:
         stated = json.loads(read_bytes(file))
-        measure, unit = stated["measure"], stated["unit"] if is_png else stated.get("unit", 1)
+        measure = stated["measure"]
+        unit = stated["unit"] if is_png and measure not in RELATIVE else stated.get("unit", 1)
         if measure not in MEASURES or isinstance(unit, bool) or not 0 < float(unit) < math.inf:
             raise ValueError(f"measure is {measure!r} and unit {unit!r}")
     except (ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:

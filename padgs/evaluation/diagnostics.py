@@ -35,8 +35,8 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # from ring to ring
 
 
 def depth_scores(view: View, rendering: Rendering, mask: Tensor | None = None) -> dict[str, float | None]:
-    """Return AbsRel and delta < 1.25 of the rendered depth, by solid angle; None without depth maps."""
-    if view.load_depth is None:
+    """Return AbsRel and delta < 1.25 of the rendered depth, by solid angle; None without measured depth."""
+    if view.load_depth is None or view.depth_is_relative:
         return {"abs_rel": None, "delta_1_25": None}
     depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
     if mask is not None:
@@ -104,7 +104,7 @@ def diagnose(render: Callable[[View], Rendering], view: View, rendering: Renderi
     metrics: dict[str, float | None] = dict.fromkeys(names)
     if view.lens is None and view.width % 2 == 0:
         metrics["yaw_error"] = yaw_error(render, view, rendering.image).item()
-    if view.load_depth is not None:
+    if view.load_depth is not None and not view.depth_is_relative:
         depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
         metrics["depth_error"] = finite_or_none(depth_error(depth, truth))
         metrics["depth_within"] = finite_or_none(depth_within(depth, truth))

@@ -34,7 +34,7 @@ def score(
         on_view = None if scores else save_image
         if name == STABILITY:
             scores[name] = _stability(render, scene, protocol, on_view)
-        elif protocol.solid_angle and any(view.load_depth for view in scene.test):
+        elif protocol.solid_angle and any(view.load_depth and not view.depth_is_relative for view in scene.test):
             scores[name] = evaluate(render, scene.test, protocol, on_view=on_view, extra=partial(_depth, protocol))
         else:
             scores[name] = evaluate(render, scene.test, protocol, on_view=on_view)

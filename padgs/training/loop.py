@@ -76,7 +76,7 @@ class Trainer:
         self._optimizer = Optimizer(groups, options.check_every, **self.ADAM)
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out, device = self._early_stopping.held_out, self._optimizer.device
-        self._unit, depth = scene.scale, options.depth_weight > 0
+        self._unit, depth = scene.scale, options.depth_kind if options.depth_weight > 0 else None
         self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=depth)
         ratio = options.outlier_ratio
         self._outliers = None if ratio is None else Outliers(scene.train, self._views.targets, ratio)

@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama
 from padgs.scene import Scene, View
-from padgs.training.loss import inverse_range_loss, photometric_loss, pixel_weight
+from padgs.training.loss import MEASURED, inverse_range_loss, photometric_loss, pixel_weight
 from padgs.training.model import State
 
 if TYPE_CHECKING:
@@ -54,12 +54,16 @@ class Targets:
         device: torch.device | str = "cpu",
         coarse_share: float = 0.0,
         *,
-        depth: bool = False,
+        depth: str | None = None,
     ) -> None:
-        """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`; `depth`: use depth maps."""
+        """Load nothing yet; `weight` is a name of ROW_WEIGHTS, `depth` one of DEPTH_KINDS if depth maps are used."""
         if depth and not any(view.load_depth for view in views):
             raise ValueError(
                 "train.depth_weight is not 0, but no training view has a depth map; put depths/ beside images/"
+            )
+        if depth == MEASURED and any(view.depth_is_relative for view in views):
+            raise ValueError(
+                "train.depth_kind is measured, but the depth maps are relative; set train.depth_kind=monocular"
             )
         self._weight, self._device, self._coarse_share, self._depth = weight, device, coarse_share, depth
         self._weights: dict[tuple[int, int], Tensor] = {}  # by the number of halvings and the index of the view
@@ -168,7 +172,7 @@ class TrainingViews:
         seed: int = 0,
         held_out: Collection[int] = (),
         *,
-        depth: bool = False,
+        depth: str | None = None,
     ) -> None:
         """Shuffle the views, except those `held_out` until `include_held_out`; other arguments as in `Targets`."""
         self._scene, self._held_out = scene, tuple(held_out)

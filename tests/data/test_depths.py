@@ -17,6 +17,7 @@ from padgs.evaluation.protocols import protocol_from_options
 from padgs.evaluation.scoring import score
 from padgs.geometry.panorama import rays
 from padgs.render import Rendering
+from padgs.training.targets import Targets
 
 LEFT_AHEAD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # body from camera, as COLMAP's benchmark states it
 
@@ -142,7 +143,7 @@ def test_a_folder_of_depths_states_what_it_holds(unit: float, world: World, tmp_
     [
         (None, np.ones((4, 8)), "holds depth maps, but there is no depth.json that says what they hold; write"),
         ('{"measure": "z"}', np.ones((4, 8)), "holds z .* but pano_00.png is a panorama, which has no such axis"),
-        ('{"measure": "disparity"}', np.ones((4, 8)), "depth.json does not say .*'disparity'.*; write .*ray"),
+        ('{"measure": "metres"}', np.ones((4, 8)), "depth.json does not say .*'metres'.*; write .*ray"),
         ('{"measure": "ray", "unit": 0}', np.ones((4, 8)), "does not say what the depth maps hold .*unit 0"),
         ('["ray"]', np.ones((4, 8)), "does not say what the depth maps hold"),
         ('{"measure": "ray"}', np.ones((4, 4)), "is 4x4, and pano_00.png is 64x32; .* the shape of its image"),
@@ -179,6 +180,26 @@ def test_an_image_of_depth_is_no_depth_map(world: World, tmp_path: Path):
     (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray"}')
     with pytest.raises(DataError, match="does not say what the depth maps hold .*'unit'"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize("measure", ["relative", "disparity"])
+def test_depth_of_one_image_is_relative_and_not_scored(measure: str, world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    (tmp_path / "depths").mkdir()
+    (tmp_path / "depths" / "depth.json").write_text(json.dumps({"measure": measure}))
+    for i, name in enumerate(world.names):
+        steps = (truth(world, i) if measure == "relative" else 1 / truth(world, i)).mul(9000).clamp(max=65535)
+        Image.fromarray(steps.numpy().astype(np.uint16)).save(tmp_path / "depths" / f"{name}.png")
+    scene = load(tmp_path)
+    view = scene.test[0]
+    ratio = view.load_depth() / truth(world, world.names.index(view.name))
+    assert view.depth_is_relative and ratio.std() < 0.01 * ratio.mean()
+    rendering = Rendering(view.image(), torch.zeros(32, 64), torch.ones(32, 64), torch.ones(1, dtype=torch.bool))
+    protocols = {"sphere": protocol_from_options("sphere", lpips="none")}
+    assert "abs_rel" not in score(lambda _: rendering, scene, protocols, None)["sphere"].metrics
+    with pytest.raises(ValueError, match="depth maps are relative; set train.depth_kind=monocular"):
+        Targets(scene.train, "uniform", depth="measured")
+    assert Targets(scene.train, "uniform", depth="monocular").at(0)[1].depth is not None
 
 
 def test_depth_is_scored_where_it_is_known(world: World, tmp_path: Path):
