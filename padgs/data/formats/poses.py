@@ -57,6 +57,19 @@ def cam_from_opengl_pose(world_from_cam: Tensor, where: str) -> Tensor:
     return rigid(OPENCV_FROM_OPENGL, torch.zeros(3, dtype=torch.float64)) @ cam_from_pose(world_from_cam, where)
 
 
+# Camera axes (right, down, forward) in the frame of scanners: x forward, y left, z up.
+PANORAMA_FROM_CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+
+
+def cam_from_panorama(quaternion: Tensor, center: Tensor, where: str) -> Tensor:
+    """Return the pose [4, 4] of a scanner's panorama, stated by a quaternion (w, x, y, z) and its centre in the world.
+
+    The centre of the image is along x of the panorama, and z points up.
+    """
+    rotation = rotation_from_quaternion(quaternion, where) @ PANORAMA_FROM_CAMERA
+    return cam_from_center(rotation.T, center, where)
+
+
 def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     """Return the rotation [3, 3] of a quaternion (w, x, y, z), which must have unit length up to rounding."""
     quaternion = _finite(quaternion, where)
