@@ -115,6 +115,7 @@ class Plan:
 
 def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     """Divide the views of a scene, in the world of its poses as the capture states them."""
+    from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
     if capture.cloud is None or not len(capture.cloud.points):
@@ -126,39 +127,48 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     tracked = capture.tracks is not None and len(capture.tracks().frame) > 0
     step = 1 if tracked else max(1, math.ceil(len(capture.cloud.points) / SAMPLE))
     points = capture.cloud.points[::step].double()
-    seen = visibility(capture, [*train, *test], points)
-    shared = seen[: len(train)].astype(np.float32)
-    affinity = shared @ shared.T
+    views, views_of_train = [*train, *test], np.arange(len(train))
+    seen = visibility(capture, views, points)
+    shared = csr_array(seen[: len(train)].astype(np.float32))
+    affinity = (shared @ shared.T).toarray().astype(np.float64)
     sizes = np.maximum(np.diag(affinity), 1)
     affinity = affinity / np.sqrt(sizes[:, None] * sizes) + 1e-6  # cameras that see nothing join any block
-    clusters = sorted((np.sort(part) for part in bisect(affinity, np.arange(len(train)), count)), key=lambda c: c[0])
-    distance = torch.cdist(torch.stack([v.center for v in train]), points).numpy()
-    weight = seen[: len(train)] / np.maximum(distance, 1e-9) ** 2 + 1e-9 / np.maximum(distance, 1e-9) ** 2
-    owner = np.stack([weight[part].sum(0) for part in clusters]).argmax(0)
-    rays = Panorama(2 * ROWS, ROWS).rays(dtype=torch.float64).reshape(-1, 3)
-    area = solid_angle_weight(ROWS, dtype=torch.float64).numpy()[:, None] / 2 / ROWS
-    area = area / solid_angle_weight(ROWS, dtype=torch.float64).sum().item()
-    directions = np.zeros((len(seen), count, ROWS, 2 * ROWS), bool)  # of each view that belong to each block
-    for row, view in enumerate([*train, *test]):
-        if len(index := seen[row].nonzero()[0]):
-            toward = (points[index] - view.center) @ view.cam_from_world[:3, :3].T
-            tree = KDTree(torch.nn.functional.normalize(toward, dim=1).numpy())
-            near = tree.query(rays.numpy(), k=[*range(1, 1 + min(NEIGHBOURS, len(index)))])[1]
-            for block in range(count):
-                held = (owner[index][near] == block).mean(1) >= 0.5
-                directions[row, block] = held.reshape(ROWS, 2 * ROWS)
-    share = (directions * area).sum((2, 3))  # [views, blocks]
+    clusters = sorted((np.sort(part) for part in bisect(affinity, views_of_train, count)), key=lambda part: part[0])
+    owner = _owners(train, seen, points, clusters)
+    rays = Panorama(2 * ROWS, ROWS).rays(dtype=torch.float64).reshape(-1, 3).numpy()
+    area = (solid_angle_weight(ROWS, dtype=torch.float64)[:, None].repeat(1, 2 * ROWS)).numpy()
+    share = np.zeros((len(views), count))  # of the sphere of each view that belongs to each block
+    directions: dict[tuple[int, int], np.ndarray] = {}  # view, block -> directions that belong to it
+    for row, view in enumerate(views):
+        if not len(index := seen[row].nonzero()[0]):
+            continue
+        toward = (points[index] - view.center) @ view.cam_from_world[:3, :3].T
+        tree = KDTree(torch.nn.functional.normalize(toward, dim=1).numpy())
+        near = owner[index][tree.query(rays, k=min(NEIGHBOURS, len(index)))[1]].reshape(len(rays), -1)
+        for block in range(count):
+            held = ((near == block).mean(1) >= 0.5).reshape(ROWS, 2 * ROWS)
+            share[row, block] = (held * area).sum() / area.sum()
+            if share[row, block] >= MARGIN:
+                directions[row, block] = held
     margin, tests, used = [], [], np.zeros((count, len(points)), bool)
     best = share[len(train) :].argmax(1) if test else np.zeros(0, int)
     for block, cluster in enumerate(clusters):
-        others = [n for n in range(len(train)) if n not in set(cluster) and share[n, block] >= MARGIN]
-        margin.append([(train[n], directions[n, block]) for n in others])
-        own = [n for n in range(len(test)) if best[n] == block] or [int(share[len(train) :, block].argmax())] * bool(
-            test
-        )
+        others = np.setdiff1d(views_of_train, cluster)
+        margin.append([(train[n], directions[n, block]) for n in others.tolist() if (n, block) in directions])
+        own = (best == block).nonzero()[0].tolist() or [share[len(train) :, block].argmax()] * bool(test)
         tests.append([test[n] for n in own])
         used[block] = (seen[cluster].mean(0) >= SEEN) | (owner == block)
     return Plan(points, owner, [[train[n] for n in cluster] for cluster in clusters], margin, tests, used)
+
+
+def _owners(train: Sequence[View], seen: np.ndarray, points: Tensor, clusters: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the block of each point: that whose cameras see it best, by the sum of 1 / distance^2."""
+    weight = np.zeros((len(clusters), len(points)))
+    for block, cluster in enumerate(clusters):
+        for row in cluster:
+            squared = (points - train[row].center).square().sum(1).numpy()
+            weight[block] += (seen[row] + 1e-9) / np.maximum(squared, 1e-18)  # unseen ones follow the nearest cameras
+    return weight.argmax(0)
 
 
 def split(source: Path, destination: Path, count: int, format: str, options: DataOptions) -> list[str]:
@@ -207,6 +217,10 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             write_transforms(content, folder)
             within = {view.name: partial_mask(view, held) for view, held in blocks.margin[number]}
             write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
+            if (folder / "masks").is_dir():
+                described = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
+                text = json.dumps(described | {"mask": "masks"}, ensure_ascii=False)
+                (folder / "transforms.json").write_text(text, encoding="utf-8")
             block = Block(number, count, os.path.relpath(source.absolute(), final.absolute()), format, given, digest)
             (folder / BLOCK).write_text(json.dumps(asdict(block), indent=1))
             parts = f"{len(core)} training views, {len(margin)} in the margin, {len(blocks.test[number])} test views"

@@ -51,7 +51,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     if prefix:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
-    named = first.get("ply_file_path")
+    named, mask = first.get("ply_file_path"), first.get("mask")
     cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
     return Capture(
         format="transforms",
@@ -60,6 +60,7 @@ def read(path: Path, options: DataOptions) -> Capture:
         frames=tuple(frames),
         cloud=cloud,
         split=split or None,
+        mask=mask.text() if mask else "auto",  # as `padgs split` states it
     )
 
 
