@@ -17,6 +17,7 @@ from padgs.cli.finished import smallest, track
 from padgs.cli.prepare import prepare
 from padgs.cli.render import render
 from padgs.cli.report import report
+from padgs.cli.score import score
 from padgs.cli.view import view
 
 app = typer.Typer(no_args_is_help=True)
@@ -38,5 +39,5 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, merge, prepare, render, report, smallest, split, track, view):
+for command in (bench, check, convert, export, merge, prepare, render, report, score, smallest, split, track, view):
     app.command()(without_traceback(command))

@@ -15,9 +15,17 @@ import typer
 from padgs.checks import printable
 from padgs.runs.interrupt import ending_by_signals
 
-Run = Annotated[str, typer.Argument(help="folder of a run, finished or not, as padgs-run names it at its end")]
+Run = Annotated[str, typer.Argument(help="folder of a run, as padgs-run names it at its end")]
+Model = Annotated[str, typer.Argument(help="folder of a run, or a .ply, .compressed.ply, .spz or .sog of Gaussians")]
+Rays = Annotated[str, typer.Option(help="of a file of Gaussians: exact, or ewa as ordinary viewers draw")]
+Transform = Annotated[
+    str, typer.Option(help="4x4 matrix, 12 numbers or a file, from the file's world to the scene's; identity: as it is")
+]
+DataPath = Annotated[
+    str | None,
+    typer.Option("--data", help="place of the data set: of a run if it has moved; of Gaussians, or a run on it"),
+]
 MAX_SEED, MAX_THREADS = 2**32 - 1, max(64, 4 * (os.cpu_count() or 1))
-DataPath = Annotated[str | None, typer.Option("--data", help="new place of its data set, if it has moved")]
 
 
 def show(text: str, stream: TextIO | None = None) -> None:

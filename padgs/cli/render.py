@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, check_range, name_place, show
+from padgs.cli.errors import DataPath, Model, Rays, Transform, check_range, name_place, show
 
 MAX_SIDE, MAX_FRAMES = 16384, 100_000  # larger images and longer videos fill the memory
 
 
 def render(
-    run: Run,
+    run: Model,
     to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; default: video.mp4 in the run's folder")] = "",
     path: Annotated[
         str, typer.Option(help="cameras, orbit, dolly, or a JSON: keyframes, nerfstudio's path")
@@ -26,6 +26,8 @@ def render(
     depth: Annotated[bool, typer.Option("--depth", help="also write depth")] = False,
     npy: Annotated[bool, typer.Option("--npy", help="depth as float32 .npy, beside the PNGs of --to FOLDER")] = False,
     data: DataPath = None,
+    rays: Rays = "exact",
+    transform: Transform = "",
 ) -> None:
     """Write a video (or PNGs) along a path, as panoramas, which players recognise, or in perspective."""
     from pathlib import Path
@@ -33,7 +35,7 @@ def render(
     from rich.console import Console
 
     from padgs.apps.camera_path_video import depth_unit, views_along, write_video
-    from padgs.runs.load import load_run
+    from padgs.apps.external import open_model
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
@@ -49,7 +51,7 @@ def render(
             f"at most {MAX_FRAMES / fps:g}"
         )
     with Console().status("opening the run") as status:
-        found = load_run(run, data_path=data)
+        found = open_model(run, data, rays, transform)
         shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
         views = views_along(found, path, seconds, fps, width, shape)
         lens = views[0].camera

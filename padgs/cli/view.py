@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from padgs import results
-from padgs.cli.errors import DataPath, Run, check_range
+from padgs.cli.errors import DataPath, Model, Rays, Transform, check_range, show
 
 if TYPE_CHECKING:
     from padgs.runs.load import LoadedRun
 
 
 def view(
-    run: Run,
+    run: Model,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
     port: Annotated[int | None, typer.Option(help="the first one to try; default 8080")] = None,
     host: Annotated[
@@ -23,6 +23,8 @@ def view(
         typer.Option(help="0.0.0.0 serves all who have the printed address; default: this machine only"),
     ] = None,
     data: DataPath = None,
+    rays: Rays = "exact",
+    transform: Transform = "",
 ) -> None:
     """Walk through a run in the browser, rendered by its own renderer; a run in training is followed."""
     from padgs.apps.viewer.server import LOCAL, PORT, has_screen, serve, wait_for_checkpoint
@@ -31,18 +33,27 @@ def view(
     folders = (run, beside) if beside else (run,)
 
     def of_one_scene() -> list[LoadedRun]:
+        from padgs.apps.external import is_splat_file, open_model
         from padgs.runs.load import load_run
 
         runs, names = [], []
+        place = data or next((folder for folder in folders if not is_splat_file(folder)), None)
         for folder in folders:
             wait_for_checkpoint(folder)
-            runs.append(found := load_run(folder, data_path=data))
+            found = (
+                open_model(folder, place, rays, transform)
+                if is_splat_file(folder)
+                else load_run(folder, data_path=data)
+            )
+            for note in getattr(found, "notes", ()):
+                show(f"  {note}")
+            runs.append(found)
             names.append(found.scene.name)
         if len({*names}) > 1:
             scenes = " and ".join(names)
             raise ValueError(f"{run} and {beside} are of two scenes, {scenes}; name two runs of one scene")
         return runs
 
-    if not all((Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
+    if not all(Path(folder).is_file() or (Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
         of_one_scene()  # raises before the page is served
     serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())

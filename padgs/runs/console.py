@@ -182,7 +182,7 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
         costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
     say(console, ", ".join(costs))
     say(console, folder, "bold")
-    if result.ok:
+    if result.ok and not result.external:
         say(console, f"next: {shlex.join(['padgs', 'view', str(folder)])}", "dim")
 
 

@@ -27,6 +27,7 @@ from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
+MAX_LOGIT = 30.0  # formats of 8 bits hold opacities of exactly 0 and 1, whose logits are infinite
 _POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*_POSITION, *_COLOR, *_LAST)
@@ -126,7 +127,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
             "means": columns("x", "y", "z"),
             "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
             "log_scales": columns("scale_0", "scale_1", "scale_2"),
-            "opacity_logits": columns("opacity")[:, 0],
+            "opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT),
             "sh_dc": columns("f_dc_0", "f_dc_1", "f_dc_2"),
             "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2),
         }

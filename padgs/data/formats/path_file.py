@@ -68,14 +68,8 @@ def _keyframe(entry: Json, up: Tensor) -> Tensor:
 
 def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -> list[Tensor]:
     scale, transform = 1.0, torch.eye(4, dtype=torch.float64)
-    if transforms.is_file():  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
-        normalized = read_json(transforms)
-        applied = Json({}, "") if transforms_json is None else read_json(transforms_json)
-        before, factor = applied.get("applied_transform"), applied.get("applied_scale")
-        transform = _homogeneous(normalized["transform"])
-        if before:
-            transform = transform @ torch.linalg.inv(_homogeneous(before))
-        scale = normalized["scale"].numbers().item() / (factor.numbers().item() if factor else 1.0)
+    if transforms.is_file():
+        scale, transform = nerfstudio_world(transforms, transforms_json)
     poses = []
     for entry in cameras.entries():
         stated = entry["camera_to_world"]
@@ -87,6 +81,21 @@ def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -
         world_from_cam[:3, :3] = transform[:3, :3].T @ world_from_cam[:3, :3] @ OPENCV_FROM_OPENGL
         poses.append(cam_from_pose(world_from_cam, stated.where))
     return poses
+
+
+def nerfstudio_world(normalized: Path, transforms_json: Path | None) -> tuple[float, Tensor]:
+    """Return s and T [4, 4]: nerfstudio's world is s (T @ x) for x in the world of the data set.
+
+    Raises:
+        DataError: a file is unreadable, or has no transform and scale.
+    """
+    values = read_json(normalized)  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
+    applied = Json({}, "") if transforms_json is None else read_json(transforms_json)
+    before, factor = applied.get("applied_transform"), applied.get("applied_scale")
+    transform = _homogeneous(values["transform"])
+    if before:
+        transform = transform @ torch.linalg.inv(_homogeneous(before))
+    return values["scale"].numbers().item() / (factor.numbers().item() if factor else 1.0), transform
 
 
 def _homogeneous(rows: Json) -> Tensor:

@@ -1,0 +1,235 @@
+"""World of a file of Gaussians: transforms that users state, and a check that the file's world is the scene's."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
+from padgs.evaluation.metrics import mean_color, ws_psnr
+from padgs.render import Rendering
+from padgs.scene import Scene, View
+from padgs.training.corrections import Similarity
+
+IDENTITY = "identity"
+WIDTH, VIEWS, SEARCHED = 128, 4, 2  # of the low-resolution renders; views of the search for another world
+MARGIN, LEAST = 3.0, 1.0  # dB above one colour per view: in the right world for sure; if no other world is better
+COARSE, FINE = (1000, 25), (6000, 100)  # points and iterations of the alignment by closest points
+INLIERS = 0.8  # share of the Gaussians that an iteration of it uses
+FINALISTS = 5  # of the aligned worlds, by distance of points; these are aligned finely and rendered
+
+
+def read_transform(text: str, transforms_json: Path | None = None) -> Similarity:
+    """Return the similarity scene_from_file that a user states.
+
+    Args:
+        text: identity, 12 or 16 numbers (rows of a matrix), or a file of them (.json, .npy, text); nerfstudio's
+            `dataparser_transforms.json` is inverted, because it maps the world of the data set to that of the model.
+        transforms_json: of the data set, whose `applied_transform` nerfstudio's file includes.
+
+    Raises:
+        ValueError: unreadable, or no rotation with a scale and a translation.
+    """
+    if text == IDENTITY:
+        return shifted(torch.zeros(3))
+    file = Path(text)
+    try:
+        if not file.is_file():
+            numbers: Any = [float(number) for number in text.replace(",", " ").split()]
+        elif file.suffix == ".npy":
+            numbers = np.load(file)
+        elif file.suffix == ".json":
+            numbers = json.loads(file.read_text())
+            if isinstance(numbers, dict):
+                return nerfstudio_similarity(file, transforms_json)
+        else:
+            numbers = file.read_text().replace(",", " ").split()
+        matrix = np.asarray(numbers, np.float64).reshape(-1, 4)
+    except (ValueError, TypeError) as error:
+        raise ValueError(
+            f"--transform {text} is no file and no 12 or 16 numbers ({error}); give a 4x4 matrix that maps the file's "
+            f"world to the scene's, row by row, or {IDENTITY}"
+        ) from error
+    return _similarity(matrix, text)
+
+
+def _similarity(matrix: np.ndarray, text: str) -> Similarity:
+    rule = "it must be a rotation times a scale, with a translation: rows of 4 numbers, the last one 0 0 0 1"
+    is_affine = matrix.shape == (3, 4) or matrix.shape == (4, 4) and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
+    if not is_affine or not np.isfinite(matrix).all():
+        raise ValueError(f"--transform {text} has {matrix.size} numbers, not those of a similarity; {rule}")
+    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    rotation = matrix[:3, :3] / (scale or 1)
+    if scale < 0:
+        raise ValueError(f"--transform {text} is a mirror image, which no rotation of Gaussians is; {rule}")
+    if scale == 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+        raise ValueError(f"--transform {text} shears, or scales axes differently; {rule}")
+    u, _, vh = np.linalg.svd(rotation)
+    return Similarity(float(scale), torch.from_numpy(u @ vh), torch.from_numpy(matrix[:3, 3].copy()))
+
+
+def shifted(by: Tensor) -> Similarity:
+    """Return the translation by a vector [3]."""
+    return Similarity(1.0, torch.eye(3, dtype=torch.float64), by.double().cpu())
+
+
+def composed(outer: Similarity, inner: Similarity) -> Similarity:
+    """Return the similarity that applies `inner`, then `outer`."""
+    scale, rotation = outer.scale * inner.scale, outer.rotation @ inner.rotation
+    return Similarity(scale, rotation, outer(inner.translation.to(outer.translation)))
+
+
+def nerfstudio_similarity(file: Path, transforms_json: Path | None) -> Similarity:
+    """Return scene_from_file of Gaussians in nerfstudio's world; a DataError if the file does not say it."""
+    scale, transform = nerfstudio_world(file, transforms_json)
+    return Similarity(scale, transform[:3, :3], scale * transform[:3, 3]).inverse()
+
+
+def as_numbers(similarity: Similarity) -> str:
+    """Return a similarity as an argument of --transform.
+
+    >>> as_numbers(Similarity(2.0, torch.eye(3), torch.tensor([0.0, 0.5, 1.0])))
+    '2 0 0 0  0 2 0 0.5  0 0 2 1'
+    """
+    rows = torch.cat((similarity.scale * similarity.rotation, similarity.translation[:, None]), dim=1)
+    rows = rows + 0.0  # no -0
+    return "  ".join(" ".join(f"{0.0 if abs(n) < 1e-9 else n:.7g}" for n in row) for row in rows.tolist())
+
+
+@dataclass(frozen=True)
+class FrameCheck:
+    """PSNR of low-resolution renders of training views, and a better world if the file's is not the scene's."""
+
+    psnr: float
+    one_color: float  # PSNR of the mean colour of each view
+    suggestion: Similarity | None = None  # scene_from_file
+    words: str = ""
+    suggested_psnr: float = 0.0
+
+    @property
+    def fits(self) -> bool:
+        """True if the renders show the scene."""
+        return self.psnr >= self.one_color + (MARGIN if self.suggestion else LEAST)
+
+    def __str__(self) -> str:
+        text = f"training views at {WIDTH} pixels: {self.psnr:.1f} dB; one colour each: {self.one_color:.1f} dB"
+        if self.fits:
+            return f"{text}; the file is in the world of the scene"
+        text += "; the file is not in the world of the scene, or shows something else"
+        if self.suggestion is None:
+            return f"{text}. No change of axes, scale and place was found that fits"
+        return f'{text}. {self.suggested_psnr:.1f} dB {self.words}: --transform "{as_numbers(self.suggestion)}"'
+
+
+def check_frame(
+    scene: Scene,
+    render: Callable[[Similarity, View], Rendering],
+    means: Tensor,
+    nerfstudio: Similarity | None = None,
+) -> FrameCheck:
+    """Render training views at a low resolution, and search for a better world if they do not fit.
+
+    Args:
+        scene: with photographs.
+        render: renders a view with the Gaussians of the file under scene_from_file.
+        means: [N, 3] of opaque Gaussians, in the file's world.
+        nerfstudio: scene_from_file by nerfstudio's `dataparser_transforms.json`, if there is one.
+    """
+    views = [view for view in scene.train if view.lens is None]
+    views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
+    if not views:
+        return FrameCheck(float("inf"), 0.0)
+    truths = [_small(view) for view in views]
+
+    def quality(scene_from_file: Similarity, count: int = VIEWS) -> float:
+        marks = [
+            ws_psnr(render(scene_from_file, view).image.clamp(0, 1).to(truth), truth, mask)
+            for view, truth, mask in truths[:count]
+        ]
+        return torch.stack(marks).mean().item()
+
+    flat = torch.stack([mean_color(truth, mask) for _, truth, mask in truths]).mean().item()
+    found = FrameCheck(quality(shifted(torch.zeros(3))), flat)
+    if found.psnr >= flat + MARGIN or not len(means):
+        return found
+    best = found
+    for words, similarity in _worlds(scene, means, nerfstudio):
+        mark = quality(similarity, SEARCHED)
+        if mark > max(best.suggested_psnr, found.psnr + LEAST, flat + LEAST):
+            best = FrameCheck(found.psnr, flat, similarity, words, mark)
+    return best
+
+
+def _small(view: View) -> tuple[View, Tensor, Tensor | None]:
+    """Return a view of `WIDTH` pixels, its image and its mask."""
+
+    def reduced(image: Tensor) -> Tensor:
+        return torch.nn.functional.interpolate(image.movedim(-1, 0)[None], (WIDTH // 2, WIDTH), mode="area")[0]
+
+    mask = view.mask()
+    small = View(view.name, view.cam_from_world, WIDTH, WIDTH // 2)
+    return small, reduced(view.image()).movedim(0, -1), None if mask is None else reduced(mask[..., None])[0]
+
+
+def _worlds(scene: Scene, means: Tensor, nerfstudio: Similarity | None) -> Iterator[tuple[str, Similarity]]:
+    """Yield worlds that a file may be in: nerfstudio's, those with other axes, and those aligned to the points."""
+    if nerfstudio is not None:
+        yield f"with nerfstudio's {TRANSFORMS}", nerfstudio
+    turns = [torch.from_numpy(turn) for turn in _axis_rotations()]
+    for turn in turns[1:]:
+        yield "with other axes", Similarity(1.0, turn, torch.zeros(3).double())
+    starts = [_closest_points(scene.points, means, Similarity(0.0, turn, torch.zeros(3)), *COARSE) for turn in turns]
+    for _, start in sorted(starts, key=lambda found: found[0])[:FINALISTS]:
+        yield (
+            "with another scale and place (estimated from points)",
+            _closest_points(scene.points, means, start, *FINE)[1],
+        )
+
+
+def _axis_rotations() -> Sequence[np.ndarray]:
+    """Return the 24 rotations that map axes to axes, the identity first."""
+    signed = [
+        np.diag(signs) @ np.eye(3)[list(order)]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    ]
+    return [matrix for matrix in signed if np.linalg.det(matrix) > 0]
+
+
+def _closest_points(
+    points: Tensor, means: Tensor, start: Similarity, count: int, iterations: int
+) -> tuple[float, Similarity]:
+    """Align means to points by iterative closest points; also return their median distance.
+
+    A start with scale 0 is a rotation: scale and place then make medians and spreads equal.
+    """
+    from scipy.spatial import cKDTree
+
+    target, source = (cloud[:: max(1, len(cloud) // count)].double().cpu().numpy() for cloud in (points, means))
+    scale, rotation, shift = start.scale, start.rotation.numpy(), start.translation.numpy()
+    if not scale:
+        centre, middle = np.median(target, 0), np.median(source, 0)
+        pairs = ((target, centre), (source, middle))
+        spread, own = (np.median(np.linalg.norm(cloud - at, axis=1)) for cloud, at in pairs)
+        scale = spread / max(own, 1e-12)
+        shift = centre - scale * rotation @ middle
+    tree = cKDTree(target)
+    for _ in range(iterations):
+        distances, nearest = tree.query(scale * source @ rotation.T + shift)
+        kept = distances <= np.quantile(distances, INLIERS)
+        a, b = target[nearest[kept]], source[kept]
+        u, sizes, vh = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+        signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vh))])
+        rotation = u * signs @ vh
+        scale = (sizes * signs).sum() / np.square(b - b.mean(0)).sum()
+        shift = a.mean(0) - scale * rotation @ b.mean(0)
+    distance = float(np.median(tree.query(scale * source @ rotation.T + shift)[0]))
+    return distance, Similarity(float(scale), torch.from_numpy(rotation), torch.from_numpy(shift))

@@ -1,0 +1,82 @@
+"""`padgs score`: Gaussians or renders of another program, scored like a run."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from padgs.cli.errors import Rays, Transform, check_range, show
+
+
+def score(
+    model: Annotated[
+        str, typer.Argument(help=".ply, .compressed.ply, .spz, .sog, or a folder with NAME.png for each test view")
+    ],
+    data: Annotated[str, typer.Option(help="folder of the data set, or of a run on it")],
+    label: Annotated[str, typer.Option(help="name in tables; default: the program that the file names")] = "",
+    rays: Rays = "exact",
+    transform: Transform = "",
+    to: Annotated[str, typer.Option(help="folder of run folders, for the result")] = "runs",
+    format: Annotated[str, typer.Option(help="of the data set; default auto")] = "",
+    width: Annotated[int, typer.Option(help="reduce the photographs to this width; 0: as they are")] = 0,
+    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder; default auto")] = "",
+    images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
+    split: Annotated[str, typer.Option(help="auto, files, every or all; default auto")] = "",
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+) -> None:
+    """Score the test views of a data set with a model that another program made; `padgs report` shows it as a row.
+
+    Gaussians are rendered by padgs: exactly along each ray, or (--rays ewa) as ordinary viewers do, with affine
+    footprints and a low-pass of 0.3 pixel on the faces of a cube. They must be in the world of the data set; training
+    views are rendered to see whether they are.
+    """
+    from dataclasses import replace
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from padgs.apps.external import ExternalOptions, ExternalRun, Renders, config_of, is_splat_file, score_external
+    from padgs.runs.config import choose_device
+    from padgs.runs.console import show_result
+    from padgs.runs.run import load_scene
+
+    check_range(0, 65536, width=width)
+    path, console = Path(model), Console()
+    if not path.exists():
+        raise FileNotFoundError(f"there is no {model}; give a file of Gaussians, or a folder of renders")
+    if not path.is_dir() and not is_splat_file(model):
+        raise ValueError(f"{model} is no .ply, .compressed.ply, .spz or .sog, and no folder of renders")
+    settings = {"format": format, "width": width, "mask": mask, "images": images, "split": split}
+    with console.status("opening the data set") as status:
+        config = config_of(data, device=device, **settings)
+        if path.is_dir():
+            if transform or rays != "exact":
+                raise ValueError("--transform and --rays belong to Gaussians; renders are taken as they are")
+            scene = load_scene(config, choose_device("cpu", config.render))
+            renders = Renders.find(path, scene)
+            scene = replace(scene, test=tuple(replace(view, load_depth=None) for view in scene.test))
+            config = replace(config, options=ExternalOptions(renders.digest()))
+            render, program = renders.render, ("", "")
+            notes = [f"{len(renders.extra)} files belong to no test view, such as {renders.extra[0]}"] * any(
+                renders.extra
+            )
+        else:
+            opened = ExternalRun.open(path, config, rays, transform, device)
+            config, scene, program, notes = opened.config, opened.scene, opened.program, [*opened.notes]
+            render = opened.method.render
+            status.update("comparing training views")
+            fit = opened.check()
+            if not fit.fits and not transform:
+                raise ValueError(f"{fit}. To score it as it is, add --transform identity")
+            notes.append(str(fit))
+        for note in (*scene.notes, *notes):
+            show(f"  {note}")
+        status.update("scoring")
+        label = label or " ".join(filter(None, program)) or path.name.partition(".")[0]
+        result, folder = score_external(render, config, scene, label, program, Path(to))
+    show_result(result, folder, console)
+    if not path.is_dir():
+        show(f"rendered by padgs with --rays {rays}")
+    show(f"next: padgs report runs {to}", sys.stdout)
