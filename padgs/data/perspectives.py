@@ -1,8 +1,7 @@
 """Perspective views resampled from panoramas, for methods that support pinhole cameras only.
 
-Pixels are interpolated on demand from the panorama, and cached in its `padgs.data.store`, if it has one. Interpolation
-is bicubic, which blurs little; near masked pixels it is bilinear and weighted by the mask, so that masked colours reach
-no view.
+Interpolation is on demand and cached in the panorama's `padgs.data.store`. It is bicubic, which blurs little; near
+masked pixels it is bilinear and weighted by the mask, so that masked colours reach no view.
 """
 
 from __future__ import annotations
@@ -91,22 +90,13 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
             f"view {panorama.name!r} has a {type(panorama.camera).__name__} camera; only panoramas can be "
             "resampled to perspective views"
         )
-    views = []
+    views, pixels, mask = [], panorama.load_pixels, panorama.load_mask
     for number, rotation in enumerate(rotations.double()):
         pose = panorama.cam_from_world.clone()
         pose[:3] = rotation.to(pose) @ pose[:3]
-        pixels, mask = panorama.load_pixels, panorama.load_mask
-        views.append(
-            View(
-                f"{panorama.name}-{number}",
-                pose,
-                lens.width,
-                lens.height,
-                None if pixels is None else _Pixels(panorama, rotation, lens, pixels),
-                None if mask is None else _Mask(panorama, rotation, lens, mask),
-                lens,
-            )
-        )
+        load_pixels = pixels and _Pixels(panorama, rotation, lens, pixels)
+        load_mask = mask and _Mask(panorama, rotation, lens, mask)
+        views.append(View(f"{panorama.name}-{number}", pose, lens.width, lens.height, load_pixels, load_mask, lens))
     return tuple(views)
 
 
@@ -127,7 +117,7 @@ def _is_visible(view: View) -> bool:
         return True
     lens = view.load_mask.lens
     shrink = min(1.0, 64 / max(lens.width, lens.height))
-    width, height = max(1, round(shrink * lens.width)), max(1, round(shrink * lens.height))
+    width, height = (max(1, round(shrink * side)) for side in (lens.width, lens.height))
     across, down = width / lens.width, height / lens.height
     grid = Pinhole(width, height, across * lens.fx, down * lens.fy, across * lens.cx, down * lens.cy)
     return bool((replace(view.load_mask, lens=grid)() > 0).any())
