@@ -9,7 +9,7 @@ import typer
 from padgs.cli.errors import check_range, show
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
-SOURCES = "metashape, e57, navvis, roam360, ricoh360, omniblender"  # besides
+SOURCES = "metashape, e57, navvis, roam360, ricoh360, omniblender, ob3d, tartanair"  # besides
 
 
 def convert(

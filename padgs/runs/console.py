@@ -145,6 +145,8 @@ MEANINGS = {  # word in the name of a metric -> meaning, with an arrow towards b
     "ssim": "↑ structural similarity",
     "lpips": "↓ perceptual distance",
     "seam": "error at ±180° over elsewhere, best 1",
+    "rel": "↓ relative error of depth",
+    "delta": "↑ share of depths within a factor of 1.25",
 }
 
 
