@@ -36,6 +36,7 @@ OVERLAY = "check.png"  # default name, beside the data
 MAX_WIDTH = 2048  # of the overlay
 MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
 MIN_POINTS = 30  # whose colours are compared
+DEPTH_TOLERANCE, DEPTH_AGREES = 0.1, 0.2  # of a distance; least share of the points, of which walls hide many
 LEAK_DISTANCE = 0.01  # of the median depth: a test view nearer to a training view tests memory
 UNEVEN_EXPOSURE = 0.1  # standard deviation of the gains in doublings, from which learning exposures helps
 EXPOSURE_VIEWS = 40  # maximum number of views for measuring exposures
@@ -122,6 +123,8 @@ def check(
     if damaged:  # the fit needs readable pixels
         return report
     _check_fit(capture, scene, report)
+    if capture.cloud is not None:
+        _check_depth(scene, report)
     if overlay is not None:
         try:
             draw_overlay((scene.test or scene.train)[0], scene.points, overlay)
@@ -129,6 +132,28 @@ def check(
         except DataError as error:
             report.problems.append(str(error))
     return report
+
+
+def _check_depth(scene: Scene, report: Report) -> None:
+    """Compare measured depth maps with the points: those that a view sees lie at its depth, others behind it."""
+    ratios, points = [], scene.points[:: -(-len(scene.points) // 20_000)].double()
+    for view in (*scene.train, *scene.test):
+        if view.load_depth is not None and not view.depth_is_relative and view.lens is None and len(ratios) < 8:
+            seen = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+            columns, rows = project(seen, view.width, view.height).floor().long().unbind(-1)
+            depth = view.load_depth().double()[rows.clamp(0, view.height - 1), columns % view.width]
+            ratios.append((depth / seen.norm(dim=-1))[torch.isfinite(depth) & (depth > 0)])
+    if not ratios or not len(ratio := torch.cat(ratios)):
+        return
+    agree, scale = ((ratio - 1).abs() < DEPTH_TOLERANCE).double().mean().item(), ratio.quantile(0.8).item()
+    text = f"depth maps agree with {agree:.0%} of the points to {DEPTH_TOLERANCE:.0%}"
+    if agree >= DEPTH_AGREES:
+        report.notes.append(text)
+        return
+    report.problems.append(
+        f"{text}, and are about {scale:.3g} times as far; correct the unit or measure in depth.json, or set "
+        "data.depth=none"
+    )
 
 
 def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> None:

@@ -202,3 +202,16 @@ def _stated(file: Path, is_png: bool) -> DepthMeaning:
     except (ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
         raise DataError(f"{file} does not say what the depth maps hold ({error}); {HOW}") from error
     return DepthMeaning(measure, float(unit), file.name)
+
+
+def write_depths(views: Sequence[View], folder: Path) -> None:
+    """Write the depth maps of views, if any has one, into `depths/` of a data set's folder."""
+    known = [view for view in views if view.load_depth is not None]
+    for view in known:
+        assert view.load_depth is not None
+        file = folder / FOLDERS[0] / f"{view.name}.npy"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.save(file, view.load_depth().numpy())
+    if known:
+        measure = RELATIVE[0] if known[0].depth_is_relative else "ray"
+        (folder / FOLDERS[0] / STATEMENT).write_text(json.dumps({"measure": measure, "unit": 1}))

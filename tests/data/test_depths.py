@@ -13,6 +13,8 @@ from support.fixtures import HALF, World, write_cloud, write_colmap_text
 
 from padgs.checks import lookup
 from padgs.data import DATASETS, DataError, load
+from padgs.data.check import check
+from padgs.data.formats.convert import convert
 from padgs.evaluation.protocols import protocol_from_options
 from padgs.evaluation.scoring import score
 from padgs.geometry.panorama import rays
@@ -168,6 +170,22 @@ def test_unknown_or_damaged_depths_are_refused(statement, values, message, world
         (tmp_path / "depths" / "depth.json").write_text(statement)
     with pytest.raises(DataError, match=message):
         load(tmp_path)
+
+
+def test_depths_are_checked_against_the_points_and_converted(world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path / "a")
+    (tmp_path / "a" / "depths").mkdir()
+    for i, name in enumerate(world.names):
+        np.save(tmp_path / "a" / "depths" / f"{name}.npy", 1000 * truth(world, i).numpy())
+    statement = tmp_path / "a" / "depths" / "depth.json"
+    statement.write_text('{"measure": "ray", "unit": 0.001}')
+    assert any("depth maps agree with 99% of the points" in note for note in check(tmp_path / "a").notes)
+    convert(tmp_path / "a", tmp_path / "b", "nerfstudio")
+    before, after = load(tmp_path / "a").train[0], load(tmp_path / "b").train[0]
+    torch.testing.assert_close(after.load_depth(), before.load_depth())
+    statement.write_text('{"measure": "ray"}')
+    (problem,) = check(tmp_path / "a").problems
+    assert "agree with 0% of the points to 10%, and are about 1e+03 times as far" in problem
 
 
 def test_an_image_of_depth_is_no_depth_map(world: World, tmp_path: Path):

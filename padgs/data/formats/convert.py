@@ -13,6 +13,7 @@ import padgs.data
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
 from padgs.data.cloud import initial_cloud
+from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import inspect, save_png
 from padgs.data.masks import write_masks
@@ -65,6 +66,7 @@ def convert(
                 points, colors, _ = initial_cloud(capture, options.points)
                 content = replace(content, cloud=Cloud(points, colors), tracks=None)
             write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
+            write_depths((*scene.train, *scene.test), partial)
             WRITERS[to](content, partial)
             if destination.exists():
                 destination.rmdir()
