@@ -151,7 +151,7 @@ def _check_depth(scene: Scene, report: Report) -> None:
         report.notes.append(text)
         return
     report.problems.append(
-        f"{text}, and are about {scale:.3g} times as far; correct the unit or measure in depth.json, or set "
+        f"{text}, and are about {scale:.2g} times as far; correct the unit or measure in depth.json, or set "
         "data.depth=none"
     )
 
