@@ -24,7 +24,6 @@ from rich.console import Console
 from torch import Tensor
 
 import padgs.data
-from padgs.checks import typed
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions
 from padgs.data.formats.writers import Content, write_transforms
@@ -50,19 +49,8 @@ ROWS = 48  # of the grid of directions that margin cameras are masked by
 NEIGHBOURS = 4  # points that decide to which block a direction belongs, by at least half
 MARGIN = 0.04  # share of the sphere of a margin camera that its block fills at least
 SEEN = 0.1  # share of the cameras of a block that see a point of another block which it begins with
-REGIONS, BLOCK = "regions.npz", "block.json"
-
-
-@dataclass(frozen=True)
-class Block:
-    """The description of a block in its folder."""
-
-    number: int  # from 0
-    count: int  # of all blocks
-    source: str  # the whole data set, relative to the folder of the block
-    format: str
-    options: dict[str, Any]  # of the loader of the source
-    regions: str  # SHA-256 of the file of regions in the parent folder
+REGIONS = "regions.npz"  # beside the blocks: points, and the block of each
+BLOCK = "block.json"  # in each block: number, count, source, format and options of its loader, SHA-256 of the regions
 
 
 def bisect(affinity: np.ndarray, members: np.ndarray, count: int) -> list[np.ndarray]:
@@ -155,7 +143,8 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     for block, cluster in enumerate(clusters):
         others = np.setdiff1d(views_of_train, cluster)
         margin.append([(train[n], directions[n, block]) for n in others.tolist() if (n, block) in directions])
-        own = (best == block).nonzero()[0].tolist() or [share[len(train) :, block].argmax()] * bool(test)
+        own = (best == block).nonzero()[0].tolist()
+        own = own or [int(share[len(train) :, block].argmax())] if test else []
         tests.append([test[n] for n in own])
         used[block] = (seen[cluster].mean(0) >= SEEN) | (owner == block)
     return Plan(points, owner, [[train[n] for n in cluster] for cluster in clusters], margin, tests, used)
@@ -217,12 +206,12 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             write_transforms(content, folder)
             within = {view.name: partial_mask(view, held) for view, held in blocks.margin[number]}
             write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
-            if (folder / "masks").is_dir():
-                described = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
-                text = json.dumps(described | {"mask": "masks"}, ensure_ascii=False)
-                (folder / "transforms.json").write_text(text, encoding="utf-8")
-            block = Block(number, count, os.path.relpath(source.absolute(), final.absolute()), format, given, digest)
-            (folder / BLOCK).write_text(json.dumps(asdict(block), indent=1))
+            if (folder / "masks").is_dir():  # they hide most of a view, and are meant to
+                described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))
+                file.write_text(json.dumps(described | {"mask": "masks"}, ensure_ascii=False), encoding="utf-8")
+            block = {"number": number, "count": count, "format": format, "options": given, "regions": digest}
+            block["source"] = os.path.relpath(source.absolute(), final.absolute())
+            (folder / BLOCK).write_text(json.dumps(block, indent=1))
             parts = f"{len(core)} training views, {len(margin)} in the margin, {len(blocks.test[number])} test views"
             lines.append(f"{final}: {parts}, {int(kept.sum())} points")
         os.replace(partial, destination)
@@ -250,29 +239,25 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
     Raises:
         ValueError: a run is of no block, missing, twice, not finished, or of another method or other settings.
     """
-    runs = [load_run(folder, device=device) for folder in folders]
-    pairs = sorted(((_block_of(run), run) for run in runs), key=lambda pair: pair[0].number)
-    blocks, runs = map(list, zip(*pairs, strict=True))
-    first, block = runs[0], blocks[0]
-    for run, other in zip(runs, blocks, strict=True):
+    loaded = [load_run(folder, device=device) for folder in folders]
+    pairs = sorted(((_block_of(run), run) for run in loaded), key=lambda pair: pair[0]["number"])
+    (block, first), runs, numbers = pairs[0], [run for _, run in pairs], [other["number"] for other, _ in pairs]
+    for other, run in pairs:
         _refuse_other(run, first)
-        if (other.regions, other.count) != (block.regions, block.count):
+        if (other["regions"], other["count"]) != (block["regions"], block["count"]):
             raise ValueError(f"{run.folder} is of another division than {first.folder}; merge runs of one padgs split")
-    numbers = [other.number for other in blocks]
-    for number in range(block.count):
+    for number in range(block["count"]):
         if numbers.count(number) != 1:
             trouble = "no run" if number not in numbers else "several runs"
-            raise ValueError(f"block {number + 1} of {block.count} has {trouble}; give one run of each block")
+            raise ValueError(f"block {number + 1} of {block['count']} has {trouble}; give one run of each block")
     folder = Path(str(first.config.data.path))
-    data = replace(
-        first.config.data, path=os.path.normpath(folder / block.source), format=block.format, **block.options
-    )
-    together = hashlib.sha256("".join(sorted(run.digest for run in runs)).encode()).hexdigest()
+    whole = {"path": os.path.normpath(folder / block["source"]), "format": block["format"], **block["options"]}
+    together = hashlib.sha256("".join(run.digest for run in runs).encode()).hexdigest()
     config = replace(
         first.config,
-        data=data,
-        variant=", ".join(filter(None, (first.config.variant, f"{block.count} blocks"))),
-        init=WarmStart(" ".join(map(str, (run.folder for run in runs))), together),
+        data=replace(first.config.data, **whole),
+        variant=", ".join(filter(None, (first.config.variant, f"{block['count']} blocks"))),
+        init=WarmStart(" ".join(str(run.folder) for run in runs), together),
     )
     scene = load_scene(config, start(config))
     store = RunStore.of(config, scene)
@@ -302,14 +287,13 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
     return store.path
 
 
-def _block_of(run: LoadedRun) -> Block:
+def _block_of(run: LoadedRun) -> dict[str, Any]:
+    """Return the description of the block of a run, which must be what the run was trained on."""
     folder = Path(run.config.data.path or "")
     if run.config.data.path is None or not (folder / BLOCK).is_file():
-        raise ValueError(
-            f"{run.folder} is no run of a block ({folder / BLOCK} is missing); train what padgs split wrote"
-        )
-    block = typed(Block, json.loads((folder / BLOCK).read_text()), str(folder / BLOCK))
-    if hashlib.sha256((folder.parent / REGIONS).read_bytes()).hexdigest() != block.regions:
+        raise ValueError(f"{run.folder} is of no block: {folder / BLOCK} is missing; train what padgs split wrote")
+    block = json.loads((folder / BLOCK).read_text())
+    if hashlib.sha256((folder.parent / REGIONS).read_bytes()).hexdigest() != block.get("regions"):
         raise ValueError(f"{folder.parent / REGIONS} is not that of {folder}; split the data set again")
     run.refuse_other_data()
     return block
@@ -317,25 +301,24 @@ def _block_of(run: LoadedRun) -> Block:
 
 def _refuse_other(run: LoadedRun, first: LoadedRun) -> None:
     """Refuse a run that did not end well, or that cannot be joined with the first one."""
-    train, model = run.config.train, run.method.model
-    if run.result is None or not run.result.ok:
-        raise ValueError(f"{run.folder} did not end well; start it again, or give another run of its block")
-    if not isinstance(model, SplatModel):
-        raise ValueError(
-            f"{run.folder} is of {run.config.method}, whose parts share parameters; merge explicit Gaussians"
-        )
-    if {train.exposures, train.poses, train.lens} != {"given"}:
-        raise ValueError(
-            f"{run.folder} learned poses, exposures or a lens, which differ between blocks; leave them given"
-        )
-    if run.config.stress.title:
-        raise ValueError(f"{run.folder} was trained under stress {run.config.stress.title}; merge runs without")
-    if (run.config.method, run.config.options, run.config.render) != (
-        first.config.method,
-        first.config.options,
-        first.config.render,
-    ):
-        raise ValueError(f"{run.folder} has other settings of method or render than {first.folder}; train them alike")
+    config, train = run.config, run.config.train
+    troubles = {
+        "did not end well; start it again": run.result is None or not run.result.ok,
+        f"is of {config.method}, whose parts share parameters; merge explicit Gaussians": not isinstance(
+            run.method.model, SplatModel
+        ),
+        "learned poses, exposures or a lens, which differ between blocks; leave them given": not (
+            train.exposures == train.poses == train.lens == "given"
+        ),
+        "was trained under stress; merge runs without": bool(config.stress.title),
+        f"has other settings of method or render than {first.folder}; train them alike": (
+            (config.method, config.options, config.render)
+            != (first.config.method, first.config.options, first.config.render)
+        ),
+    }
+    for trouble, holds in troubles.items():
+        if holds:
+            raise ValueError(f"{run.folder} {trouble}")
 
 
 def _joined(

@@ -31,7 +31,8 @@ def split(
     for line in lines:
         show(line)
     names = ",".join(line.partition(": ")[0] for line in lines)
-    show(f"next: {shlex.join(['padgs-run', '-m', f'data.path={names}'])}, then padgs merge with the runs")
+    command = shlex.join(["padgs-run", "-m", f"data.path={names}", *(["data.split=all"] if split == "all" else [])])
+    show(f"next: {command}, then padgs merge with the runs")
 
 
 def merge(

@@ -99,6 +99,8 @@ def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
         assert all(by_name[view.name].mask() is None for view in core)
         assert len(scene.points) < 0.9 * len(whole.points)
         assert all(path.is_symlink() for path in (part / "images").iterdir())
+    alone = blocks.plan(capture, assemble(capture, DataOptions(split="all")), 2)
+    assert alone.test == [[], []] and sum(map(len, alone.core)) == 20
     tests = [view.name for scene in loaded for view in scene.test]
     assert sorted(tests) == sorted(view.name for view in whole.test)
 
@@ -134,7 +136,7 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
     assert "block 1 of 2 has several runs" in error(*runs, runs[0])
     assert "whose parts share parameters" in error(trained(parts[0], tmp_path, "method=padgs"), runs[1])
     assert "has other settings of method" in error(runs[0], trained(parts[1], tmp_path, "method.sh_degree=1"))
-    assert "is no run of a block" in error(trained(source, tmp_path), runs[1])
+    assert "is of no block" in error(trained(source, tmp_path), runs[1])
     copy = shutil.copytree(runs[0], tmp_path / "copy")
     results.write(replace(results.read(copy / "result.json"), status="nan", reason="x"), copy)
     assert "did not end well" in error(str(copy), runs[1])
