@@ -22,6 +22,7 @@ def check(
         typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none"),
     ] = None,
     mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
+    depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",
     images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:
@@ -37,7 +38,7 @@ def check(
         report = look_through(
             Path(path),
             format=format,
-            options=DataOptions(mask=mask, images=images or None, split=split),
+            options=DataOptions(mask=mask, depth=depth, images=images or None, split=split),
             overlay=overlay_path(Path(path)) if overlay is None else Path(overlay) if overlay else None,
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )

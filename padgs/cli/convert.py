@@ -22,6 +22,7 @@ def convert(
         str, typer.Option(help="auto, random, or a PLY, LAS or E57 file in the source's folder")
     ] = "auto",
     mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
+    depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:
     """Write a data set in another format. Exit code 1, and nothing written, if that is impossible."""
@@ -39,7 +40,7 @@ def convert(
             Path(destination),
             to,
             format=format,
-            options=DataOptions(width=width or None, points=points, mask=mask, split=split),
+            options=DataOptions(width=width or None, points=points, mask=mask, depth=depth, split=split),
             progress=lambda done, total: status.update(f"image {done} of {total}"),
         )
     for note in scene.notes:

@@ -13,12 +13,16 @@ from support.fixtures import HALF, World, write_cloud, write_colmap_text
 
 from padgs.checks import lookup
 from padgs.data import DATASETS, DataError, load
+from padgs.data.capture import DepthMeaning
 from padgs.data.check import check
+from padgs.data.depths import Depth
 from padgs.data.formats.convert import convert
 from padgs.evaluation.protocols import protocol_from_options
 from padgs.evaluation.scoring import score
+from padgs.geometry.camera import Pinhole
 from padgs.geometry.panorama import rays
 from padgs.render import Rendering
+from padgs.scene import View
 from padgs.training.targets import Targets
 
 LEFT_AHEAD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # body from camera, as COLMAP's benchmark states it
@@ -198,6 +202,12 @@ def test_an_image_of_depth_is_no_depth_map(world: World, tmp_path: Path):
     (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray"}')
     with pytest.raises(DataError, match="does not say what the depth maps hold .*'unit'"):
         load(tmp_path)
+
+
+def test_z_of_a_perspective_view_becomes_the_distance_along_the_ray(tmp_path: Path):
+    view = View("a", torch.eye(4, dtype=torch.float64), 8, 4, lens=Pinhole(8, 4, 3.0, 3.0, 4.0, 2.0))
+    wall = Depth(tmp_path, DepthMeaning("z", 0.5, "test"), view, np.full((2, 4), 4, np.float32))()
+    torch.testing.assert_close(wall * view.camera.rays()[..., 2], torch.full((4, 8), 2.0))
 
 
 @pytest.mark.parametrize("measure", ["relative", "disparity"])
