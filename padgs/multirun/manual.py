@@ -11,6 +11,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from padgs.baselines import METHODS
+from padgs.data.datasets import DATASETS
 from padgs.multirun.composition import composing, configuration
 from padgs.multirun.overrides import root
 from padgs.runs.config import DataConfig, Settings, scene_choices
@@ -37,7 +38,7 @@ def manual(arguments: Sequence[str], width: int | None = None) -> str:
     for group in GROUPS:
         folder = root() / ("sweeps" if group == "+sweep" else "conf") / group.lstrip("+")
         registered = {"method": METHODS, "+scene": scene_choices()}.get(group, ())
-        names = ", ".join(sorted({path.stem for path in folder.glob("*.yaml")} | {*registered}))
+        names = ", ".join(sorted({path.stem for path in folder.glob("*.yaml")} | set(map(_shortened, registered))))
         lines += textwrap.wrap(names, width, initial_indent=f"  {group}=", subsequent_indent=" " * 6)
     lines += ["", f"Keys, with their defaults under method={config.preset}:"]
     common = Settings(**{field.name: getattr(config, field.name) for field in fields(Settings)})
@@ -46,6 +47,12 @@ def manual(arguments: Sequence[str], width: int | None = None) -> str:
         line = f"{f'  {key}={shown}':<34}  {meaning}".rstrip()
         lines += textwrap.wrap(line, width, subsequent_indent=" " * 36)
     return "\n".join(lines)
+
+
+def _shortened(choice: str) -> str:
+    """Return a choice; the many scenes of data sets in nested folders have one entry, such as ob3d_FOLDER_SCENE."""
+    known = DATASETS.get(choice.partition("_")[0])
+    return f"{choice.partition('_')[0]}_FOLDER_SCENE" if known and known.nested else choice
 
 
 def keys(options: Any, where: str = "") -> Iterator[tuple[str, Any, str]]:
