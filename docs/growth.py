@@ -73,7 +73,7 @@ def series(quick: bool) -> dict[str, list[tuple[int, float, float]]]:
 
 def exponent(found: list[tuple[int, float, float]], column: int) -> float:
     """Return p of the power law, number^p, that fits a column best."""
-    numbers, values = (np.log([row[index] for row in found]) for index in (0, column))
+    numbers, values = (np.log([max(row[index], 1e-3) for row in found]) for index in (0, column))
     return float(np.polyfit(numbers, values, 1)[0])
 
 

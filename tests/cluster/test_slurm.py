@@ -113,6 +113,7 @@ def test_the_same_command_goes_on_after_the_login_process_was_killed(tmp_path):
     killed = start(*arguments)
     wait(lambda: "R" in call("squeue", "-h", "-n", "padgs", "-o", "%t").split())
     killed.kill()
+    end(killed)
     assert "4 of 4 done" in end(start(*arguments))
 
 
