@@ -44,7 +44,7 @@ class Outliers:
             )
         centers = torch.stack([view.center.double().cpu() for view in views])
         distances = torch.cdist(centers, centers).fill_diagonal_(math.inf)
-        self._nearest = distances.argsort(1, stable=True)[:, : min(OTHERS, len(views) - 1)].tolist()
+        self._nearest = distances.argsort(dim=1, stable=True)[:, : min(OTHERS, len(views) - 1)].tolist()
         self._targets, self._ratio = targets, ratio
 
     @torch.no_grad()
