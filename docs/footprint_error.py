@@ -2,8 +2,8 @@
 
     python docs/footprint_error.py
 
-writes the table in docs/notes/projection_error.md and the figure docs/footprint_error.png in about two minutes. Tests compare the
-table with the numbers computed here.
+writes the table in docs/notes/projection_error.md and the figure docs/footprint_error.png in about two minutes. Tests
+compare the table with the numbers computed here.
 
 The truth is the ray response, the largest value of the Gaussian along each ray; projection `ray` computes it, the
 others approximate it. The error of a footprint is the integral over the sphere of |footprint - truth|, relative to the

@@ -36,7 +36,7 @@ class View:
     load_mask: Callable[[], Tensor] | None = None  # () -> [H, W] float32 in [0, 1], 0 = ignore this pixel
     lens: Camera | None = None  # None: a panorama of this size
     load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] distance along the ray; 0, NaN = unknown, inf = sky
-    depth_is_relative: bool = False  # inverse distances are known up to a scale and a shift, as of one image; not scored
+    depth_is_relative: bool = False  # inverse distances are known up to a scale and a shift; not scored
 
     @property
     def camera(self) -> Camera:

@@ -85,7 +85,7 @@ class Place:
 
     @property
     def seen(self) -> str:
-        """Whether settings of methods were chosen on the scene: NEVER_SEEN or TUNED_ON; empty where nothing is known.
+        """Return NEVER_SEEN or TUNED_ON, or nothing where it is not known whether settings were chosen on the scene.
 
         >>> Place("", "flat").seen, Place("", "plaza").seen, Place("", "my_house").seen
         ('tuned on', 'never seen', '')

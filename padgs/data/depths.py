@@ -148,7 +148,7 @@ def _exr(file: Path) -> NDArray:
     try:
         import OpenEXR  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise DataError(f"{file}: reading EXR needs OpenEXR: {install_command('exr')}; or set data.depth=none") from error
+        raise DataError(f"{file}: EXR needs OpenEXR: {install_command('exr')}; or set data.depth=none") from error
     try:
         channels = OpenEXR.File(str(file), separate_channels=True).channels()
         pixels = {name: np.asarray(channel.pixels) for name, channel in channels.items() if name != "A"}

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from padgs.data.assemble import IMAGE_FOLDERS, view_name
 from padgs.data.camera_paths import gravity
@@ -307,6 +306,8 @@ def level_world(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, .
     estimate = gravity(torch.stack([frame.cam_from_world for frame in frames]))
     if estimate.agreement < LEVEL_AGREEMENT:
         return frames, cloud, "the cameras have no common up direction; the world is not rotated"
+    from scipy.spatial.transform import Rotation
+
     new_from_old = torch.from_numpy(Rotation.align_vectors([(0.0, 0.0, 1.0)], [estimate.up])[0].as_matrix())
     old_from_new = torch.eye(4, dtype=torch.float64)
     old_from_new[:3, :3] = new_from_old.mT

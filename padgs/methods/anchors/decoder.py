@@ -1,8 +1,7 @@
 """The decoder: three small networks that turn an anchor as seen from a camera into K Gaussians (paper Eq. 13-14).
 
 `decode_gaussians` is a pure function of tensors. It calls a native library if there is one (float32 on the CPU, any
-precision on a GPU); `define_gaussians` is the definition. A reduced precision concerns the products of the networks
-only.
+precision on a GPU); `define_gaussians` is the definition. Only products of the networks have a reduced precision.
 """
 
 from __future__ import annotations
