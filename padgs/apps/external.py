@@ -119,6 +119,7 @@ class ExternalRun(LoadedRun):
     notes: tuple[str, ...] = ()
     program: tuple[str, str] = ("", "")  # name and version
     given: Similarity | None = None  # scene_from_file, as the user stated it
+    file: Path = Path()
 
     @classmethod
     def open(cls, file: Path, config: RunConfig | None, rays: str, transform: str, device: str) -> ExternalRun:
@@ -165,7 +166,7 @@ class ExternalRun(LoadedRun):
         folder = file.with_name(re.sub(r"(\.compressed)?\.\w+$", "", file.name))
         method = ExternalMethod.of(splats, render)
         result = initial_result(config, scene, folder.name)
-        run = cls(folder, config, method, result, 0, "", tuple(notes), program, moved)
+        run = cls(folder, config, method, result, 0, "", tuple(notes), program, moved, file)
         run.scene = scene
         return run
 

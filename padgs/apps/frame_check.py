@@ -211,7 +211,7 @@ def _closest_points(
 
     A start with scale 0 is a rotation: scale and place then make medians and spreads equal.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     target, source = (cloud[:: max(1, len(cloud) // count)].double().cpu().numpy() for cloud in (points, means))
     scale, rotation, shift = start.scale, start.rotation.numpy(), start.translation.numpy()
@@ -221,7 +221,7 @@ def _closest_points(
         spread, own = (np.median(np.linalg.norm(cloud - at, axis=1)) for cloud, at in pairs)
         scale = spread / max(own, 1e-12)
         shift = centre - scale * rotation @ middle
-    tree = cKDTree(target)
+    tree = KDTree(target)
     for _ in range(iterations):
         distances, nearest = tree.query(scale * source @ rotation.T + shift)
         kept = distances <= np.quantile(distances, INLIERS)

@@ -20,6 +20,9 @@ def export(
         int | None,
         typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300"),
     ] = None,
+    crop: Annotated[
+        str, typer.Option(help="box of the scene to keep, six numbers: lowest and highest x y z; padgs view shows them")
+    ] = "",
     data: DataPath = None,
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply.
@@ -43,6 +46,7 @@ def export(
     steps = DISTILLATION_STEPS if distillation_steps is None else distillation_steps
     path = Path(to) if to else Path(run) / "splats.ply"
     check_suffix(path)
+    box = _box(crop) if crop else None
     with Console().status("opening the run") as status:
         trained = load_run(run, data_path=data)
         with name_place(path):
@@ -53,6 +57,7 @@ def export(
             distillation_steps=steps,
             upright=upright or path.suffix == ".html",
             smooth=smooth or path.suffix == ".html",
+            crop=box,
             progress=lambda done: status.update(f"distillation step {done} of {steps}"),
         )
         status.update(Text(f"writing {printable(path.name)}"))
@@ -60,3 +65,13 @@ def export(
             write_splats(path, found.splats, found.notes, start=found.start)
     show("\n".join(f"  {note}" for note in found.notes))
     show(f"{path}: {len(found.splats)} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _box(text: str) -> list[float]:
+    try:
+        box = [float(number) for number in text.replace(",", " ").split()]
+    except ValueError:
+        box = []
+    if len(box) != 6 or not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise ValueError(f"--crop is {text}; it must be six numbers, lowest x y z and then a higher x y z each")
+    return box

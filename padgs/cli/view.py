@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,4 +57,7 @@ def view(
 
     if not all(Path(folder).is_file() or (Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
         of_one_scene()  # raises before the page is served
-    serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
+    try:
+        serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
+    finally:
+        show(f"next: {shlex.join(['padgs', 'render', run])}  (--path film.json after saving a film)")

@@ -17,11 +17,11 @@ def to_uint8(image: Tensor) -> np.ndarray:
     return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
-def error_image(image: Tensor, truth: Tensor) -> np.ndarray:
+def error_image(image: Tensor, truth: Tensor, gain: float = 1.0) -> np.ndarray:
     """Return the absolute difference, averaged over channels, as colours [H, W, 3] uint8; one scale for all images."""
     import matplotlib
 
-    error = (image - truth).detach().abs().mean(-1).cpu().numpy() / ERROR_FULL_SCALE
+    error = (image - truth).detach().abs().mean(-1).cpu().numpy() * (gain / ERROR_FULL_SCALE)
     return matplotlib.colormaps[ERROR_COLORS](np.clip(error, 0, 1), bytes=True)[..., :3]
 
 

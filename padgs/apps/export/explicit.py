@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import torch
@@ -43,6 +44,7 @@ def export_run(
     distillation_steps: int = DISTILLATION_STEPS,
     upright: bool = False,
     smooth: bool = False,
+    crop: Sequence[float] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """Convert a run to explicit Gaussians, in the world of its scene.
@@ -53,10 +55,11 @@ def export_run(
         upright: rotate the world so that the cameras' up is -y, as viewers expect.
         smooth: include the 3D filter (`padgs.methods.splats.smoothing_filter`) in the scales, if there is one;
             viewers have no such filter, and show sharp Gaussians as needles.
+        crop: lowest and highest x y z; Gaussians with their mean outside are left out.
         progress: called with the number of completed distillation steps.
 
     Raises:
-        ValueError: the run has no Gaussians.
+        ValueError: the run has no Gaussians, or none in the crop.
         DataError: the data set is missing, and needed for more than Gaussians as trained.
     """
     model = run.method.model
@@ -75,6 +78,14 @@ def export_run(
         notes.append(loss)
     else:
         raise ValueError(f"{run.config.method} has no Gaussians to export; use padgs render or padgs view")
+    if crop is not None:
+        low, high = splats.means.new_tensor(crop).view(2, 3)
+        inside = ((splats.means >= low) & (splats.means <= high)).all(-1)
+        if not inside.any():
+            raise ValueError(f"no Gaussian lies in the box from {low.tolist()} to {high.tolist()}; enlarge --crop")
+        notes.append(f"cropped to {int(inside.sum())} of {len(splats)} Gaussians")
+        splats = deepcopy(splats)
+        splats.load({name: rows[inside] for name, rows in splats.rows().items()})
     kind = f"{config.low_pass:g} in {config.resolved_low_pass_kind}"
     notes.append(f"trained with projection {config.projection} and a low-pass of {kind}; those of viewers differ")
     notes.append(AXES)

@@ -8,13 +8,26 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
-from padgs.apps.viewer.renders import CAMERAS, LAYERS, Box, RunRenderer, ViewOptions, side_by_side
+from padgs.apps.viewer.controls import CropControls, FilmControls
+from padgs.apps.viewer.renders import (
+    CAMERAS,
+    LAYERS,
+    Box,
+    RunRenderer,
+    ViewOptions,
+    captioned,
+    level,
+    side_by_side,
+    with_legend,
+)
 from padgs.apps.viewer.server import Server
 from padgs.data.camera_paths import gravity
 from padgs.runs.load import LoadedRun
@@ -24,7 +37,8 @@ IDLE_SECONDS = 0.2  # without a change, after which the full resolution is rende
 FRAME_SECONDS = 0.06  # target while something changes; the resolution adapts
 MIN_RESOLUTION = 0.125  # factor on width and height
 WIDTHS = ("512", "768", "1024", "1536", "2048")
-FOVS = range(20, 141)  # degrees
+FOVS, GAINS = range(20, 141), range(1, 17)  # degrees, factors
+HELP = "**drag**: look around; **right-drag**: shift; **scroll**: go; keys **W A S D** go, **Q E** down and up"
 MAX_NUMBER = 1e15  # of a camera or crop, whose square is a finite float32
 BOTH = "side by side"
 
@@ -38,15 +52,20 @@ class PageState:
     width: int
     height: int
     renderers: tuple[RunRenderer, ...]
+    names: tuple[str, ...] = ()  # of the renderers, written into a comparison
 
     def render(self, resolution: float) -> np.ndarray:
         """Render the image at a fraction of its full width and height."""
-        width = self.width // len(self.renderers)
+        width, options = self.width // len(self.renderers), self.options
         images = [
-            renderer.render(self.options, self.cam_from_world, width, self.height, resolution)
-            for renderer in self.renderers
+            renderer.render(options, self.cam_from_world, width, self.height, resolution) for renderer in self.renderers
         ]
-        return images[0] if len(images) == 1 else side_by_side(*images)
+        if options.layer != "colours":
+            scale = self.renderers[0].run.scene.scale
+            images = [with_legend(image, options.layer, scale, options.gain) for image in images]
+        if len(images) == 1:
+            return images[0]
+        return side_by_side(*(captioned(image, name) for image, name in zip(images, self.names, strict=True)))
 
 
 class Page:
@@ -70,9 +89,12 @@ class Page:
         scene = renderers[0].run.scene
         self._views = {view.name: view for view in (*scene.train, *scene.test)}
         gui = client.gui
+        gui.add_markdown(HELP)
         self._summary = gui.add_markdown("rendering the first image")
         self._camera = gui.add_dropdown("camera", CAMERAS)
-        self._layer = gui.add_dropdown("show", LAYERS)
+        layers = tuple(layer for layer in LAYERS if layer != "error" or scene.train[0].load_pixels is not None)
+        self._layer = gui.add_dropdown("show", layers)
+        self._gain = gui.add_slider("gain of the error", min=GAINS[0], max=GAINS[-1], step=1, initial_value=1)
         folders = [renderer.run.folder.name for renderer in renderers]
         names = folders if len(folders) == 1 else [f"{number}: {name}" for number, name in enumerate(folders, 1)]
         self._by_name = dict(zip(names, self._renderers, strict=True))
@@ -80,24 +102,24 @@ class Page:
         self._run = gui.add_dropdown("run", runs)
         self._fov = gui.add_slider("degrees across", min=FOVS[0], max=FOVS[-1], step=1, initial_value=75)
         self._width = gui.add_dropdown("pixels across", WIDTHS, initial_value="1024")
-        self._offers = {"camera": CAMERAS, "layer": LAYERS, "run": runs, "fov": FOVS, "width": WIDTHS}
+        self._offers = {"camera": CAMERAS, "layer": layers, "gain": GAINS, "run": runs, "fov": FOVS, "width": WIDTHS}
         self._target = gui.add_dropdown("go to", ("", *self._views))
         self._frusta_shown = gui.add_checkbox("cameras", initial_value=False)
+        self._level = gui.add_checkbox("level panoramas", initial_value=True, hint="dragging does not tilt them")
+        gui.add_button("save picture").on_click(lambda _: self.save_picture())
         if may_stop and any(renderer.run.result is None for renderer in renderers):
             gui.add_button("stop and score", hint="end training now").on_click(lambda _: self._confirm_stop())
-        with gui.add_folder("crop", expand_by_default=False):
-            can_crop = all(renderer.can_crop for renderer in renderers)
-            self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not can_crop)
-            step = float(np.ptp(box, axis=0).max() / 200)
-            self._low, self._high = (
-                gui.add_vector3(name, tuple(float(f"{step * round(c / step):.6g}") for c in corner), step=step)
-                for name, corner in zip(("lowest", "highest"), box, strict=True)
-            )
+        folder, can_crop = renderers[0].run.folder, all(renderer.can_crop for renderer in renderers)
+        self._up = torch.tensor(
+            gravity(torch.stack([view.cam_from_world for view in scene.train])).up, dtype=torch.float64
+        )
+        model = getattr(renderers[0].run, "file", folder)  # as commands name it
+        self._crop = CropControls(client, box, model, can_crop, self.redraw)
+        self._film = FilmControls(client, folder, model, scene.origin, lambda: self.state().cam_from_world, may_stop)
         self._frusta = [self._frustum(view) for view in self._views.values()]
-        for control in (self._camera, self._layer, self._run, self._fov, self._width, self._frusta_shown):
+        for control in (self._camera, self._layer, self._gain, self._run, self._fov, self._width, self._level):
             control.on_update(self.redraw)
-        for control in (self._crop, self._low, self._high):
-            control.on_update(self.redraw)
+        self._frusta_shown.on_update(self.redraw)
         self._target.on_update(
             lambda _: self.go_to(self._views[self._target.value]) if self._target.value in self._views else None
         )
@@ -135,8 +157,10 @@ class Page:
         for name, offer in self._offers.items():
             if (value := getattr(self, f"_{name}").value) not in offer:
                 raise ValueError(f"{name} = {str(value)[:40]!r} is not one of the page's choices; choose one of them")
-        crop: Box | None = (self._low.value, self._high.value) if self._crop.value else None
-        options = ViewOptions(self._camera.value, self._layer.value, float(self._fov.value), crop)
+        crop = self._crop.box
+        options = ViewOptions(
+            self._camera.value, self._layer.value, float(self._fov.value), crop, float(self._gain.value)
+        )
         camera = self._client.camera
         numbers = np.concatenate((camera.wxyz, camera.position, *(crop or ())))
         if not np.all(np.abs(numbers) < MAX_NUMBER) or not np.linalg.norm(camera.wxyz) > 1 / MAX_NUMBER:  # also NaN
@@ -145,8 +169,20 @@ class Page:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width, height = sides(int(self._width.value), camera.aspect)
-        renderers = self._renderers if self._run.value == BOTH else (self._by_name[self._run.value],)
-        return PageState(options, torch.from_numpy(pose), width, height, renderers)
+        names = tuple(self._by_name) if self._run.value == BOTH else (self._run.value,)
+        cam_from_world = torch.from_numpy(pose)
+        if options.camera == "panorama" and self._level.value:
+            cam_from_world = level(cam_from_world, self._up)
+        renderers = tuple(self._by_name[name] for name in names)
+        return PageState(options, cam_from_world, width, height, renderers, names)
+
+    def save_picture(self) -> None:
+        """Let the browser download the picture, at full resolution."""
+        with self._lock:
+            image = self.state().render(1.0)
+        content = BytesIO()
+        Image.fromarray(image).save(content, "PNG")
+        self._client.send_file_download(f"{self._renderers[0].run.folder.name}.png", content.getvalue())
 
     def _confirm_stop(self) -> None:
         gui = self._client.gui
@@ -204,6 +240,7 @@ class Page:
                 camera.fov = 2 * np.arctan(np.tan(np.radians(state.options.fov) / 2) * state.height / state.width)
             for frustum in self._frusta:
                 frustum.visible = bool(self._frusta_shown.value) and has_overlay
+            self._crop.show(has_overlay)
             self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=90 if resolution == 1 else 60)
             text = f"{1000 * seconds:.0f} ms, {image.shape[1]}x{image.shape[0]}"
             if state.options.layer == "error":

@@ -7,9 +7,18 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from PIL import Image, ImageDraw
 from torch import Tensor
 
-from padgs.evaluation.images import depth_image, error_image, to_uint8
+from padgs.data.camera_paths import look_along
+from padgs.evaluation.images import (
+    DEPTH_COLORS,
+    ERROR_COLORS,
+    ERROR_FULL_SCALE,
+    depth_image,
+    error_image,
+    to_uint8,
+)
 from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.geometry.panorama import sample
 from padgs.methods.anchors.method import AnchorModel
@@ -31,6 +40,7 @@ class ViewOptions:
     layer: str = "colours"  # a name of `LAYERS`; error: at the nearest view of the scene
     fov: float = 75.0  # horizontal degrees of a perspective camera
     crop: Box | None = None  # Gaussians outside are not rendered
+    gain: float = 1.0  # factor on the error
 
 
 class RunRenderer:
@@ -90,7 +100,7 @@ class RunRenderer:
         )
         view = View("page", cam_from_world, lens.width, lens.height, lens=lens)
         if options.layer == "error":
-            image = self._error_from(view)
+            image = self._error_from(view, options.gain)
         else:
             rendering = self._method(full, options.crop).render(view)
             image = (
@@ -119,19 +129,19 @@ class RunRenderer:
             return method
         return crop_model(method.with_renderer(method.render_config), crop)
 
-    def _error_from(self, view: View) -> np.ndarray:
+    def _error_from(self, view: View, gain: float) -> np.ndarray:
         """Return the error image of the nearest view of the scene, resampled to the directions of a view."""
         nearest = self.nearest(view.cam_from_world)
-        error = torch.from_numpy(self._error(nearest.name)).float()
+        error = torch.from_numpy(self._error(nearest.name, gain)).float()
         rotation = nearest.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].mT.to(nearest.cam_from_world)
         return sample(error, view.camera.rays() @ rotation.float().cpu().mT).round().byte().numpy()
 
-    def _error_image(self, name: str) -> np.ndarray:
+    def _error_image(self, name: str, gain: float) -> np.ndarray:
         scene = self.run.scene
         view = next(view for view in (*scene.train, *scene.test) if view.name == name)
         image = self.run.method.render(view).image
         truth, mask = view.image(device=image.device), view.mask(device=image.device)
-        return error_image(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth).copy()
+        return error_image(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth, gain).copy()
 
 
 def crop_model(method: Method, crop: Box) -> Method:
@@ -141,6 +151,46 @@ def crop_model(method: Method, crop: Box) -> Method:
     low, high = (positions.new_tensor(corner) for corner in crop)
     model.keep(((positions >= low) & (positions <= high)).all(-1))
     return method
+
+
+def level(cam_from_world: Tensor, up: Tensor) -> Tensor:
+    """Return the pose [4, 4] at the same place and with the same heading, but upright."""
+    center = View("", cam_from_world, 1, 1).center
+    heading = cam_from_world[2, :3] - (cam_from_world[2, :3] @ up) * up
+    if heading.norm() < 1e-6:  # straight down the top of the image is ahead, straight up its bottom
+        heading = cam_from_world[1, :3] * torch.sign(cam_from_world[2, :3] @ up)
+        heading = heading - (heading @ up) * up
+    return look_along(center[None].numpy(), heading[None].numpy(), up.numpy())[0]
+
+
+def captioned(image: np.ndarray, text: str) -> np.ndarray:
+    """Write a text into the upper left corner of an image."""
+    picture = Image.fromarray(image)
+    draw = ImageDraw.Draw(picture)
+    size = max(9, picture.width // 50)
+    draw.text((size, size // 2), text, (255, 255, 255), font_size=size, stroke_width=2, stroke_fill=(0, 0, 0))
+    return np.asarray(picture)
+
+
+def with_legend(image: np.ndarray, layer: str, scale: float, gain: float) -> np.ndarray:
+    """Draw the colour bar of depth, with distances in world units, or of the error, into the lower left corner."""
+    import matplotlib
+
+    height, width = image.shape[:2]
+    rows, columns = max(3, height // 50), width // 4
+    along = np.linspace(0, 1, columns)
+    colors = matplotlib.colormaps[DEPTH_COLORS if layer == "depth" else ERROR_COLORS](along, bytes=True)[:, :3]
+    bar = image.copy()
+    left, top = max(2, width // 40), height - 2 * rows
+    bar[top : top + rows, left : left + columns] = colors
+    picture = Image.fromarray(bar)
+    draw, size = ImageDraw.Draw(picture), max(8, width // 70)
+    for share in (0.2, 0.5, 0.8) if layer == "depth" else (0.0, 0.5, 1.0):
+        value = scale * (1 - share) / share if layer == "depth" else share * ERROR_FULL_SCALE / gain
+        place = (left + round(share * columns), top - 2)
+        text = f"{value:.3g}"
+        draw.text(place, text, (255, 255, 255), font_size=size, anchor="mb", stroke_width=2, stroke_fill=(0, 0, 0))
+    return np.asarray(picture)
 
 
 def side_by_side(left: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -85,6 +85,22 @@ def test_refined_poses_are_aligned_with_the_scene(tmp_path_factory):
     assert (run.method.model.render(view).image - own).abs().max() > 0.05, "it is another world"
 
 
+def test_a_box_is_cropped(splat_run, tmp_path):
+    run = padgs.load_run(splat_run)
+    means = run.method.model.splats.means.detach()
+    middle = means[:, 0].median().item()
+    result = export(str(splat_run), "--crop", f"{middle} -99 -99 99,99,99", "--to", str(tmp_path / "c.ply"))
+    assert result.exit_code == 0 and "cropped to" in result.output, result.output
+    assert len(read_splats(tmp_path / "c.ply")) == int((means[:, 0] >= middle).sum()) < len(means)
+    for box, message in (
+        ("1 2", "must be six numbers"),
+        ("0 0 0 1 1 -1", "must be six"),
+        ("8 8 8 9 9 9", "no Gaussian"),
+    ):
+        result = export(str(splat_run), "--crop", box, "--to", str(tmp_path / "d.ply"))
+        assert result.exit_code == 1 and message in result.output + result.stderr
+
+
 def test_upright_worlds(splat_run, tmp_path):
     assert export(str(splat_run), "--upright", "--to", str(tmp_path / "new" / "u.ply")).exit_code == 0
     assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "new" / "u.ply"))["vertex"].comments)

@@ -147,11 +147,11 @@ def test_forged_values_are_ignored(run):
             for value in forged:
                 update(control, value, "is not one of the page's choices")
                 update(control, right, " ms")
-        update(page._crop, True, " ms")
-        low = page._low.value
+        update(page._crop.is_on, True, " ms")
+        low = page._crop.low.value
         for value in ((nan, 0, 0), (inf, 0, 0), (1e300, 0, 0)):
-            update(page._low, value, "numbers below")
-            update(page._low, low, " ms")
+            update(page._crop.low, value, "numbers below")
+            update(page._crop.low, low, " ms")
         for change in ({"position": (nan, 0, 0)}, {"position": (1e200, 0, 0)}, {"wxyz": (0, 0, 0, 0)}):
             send(CAMERA | change)
             until(lambda: "numbers below" in page._summary.content)

@@ -1,13 +1,18 @@
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from support.tiny_run import tiny_run
 
 import padgs
-from padgs.apps.viewer.renders import RunRenderer, ViewOptions, side_by_side
+from padgs.apps.viewer.controls import FilmControls
+from padgs.apps.viewer.renders import RunRenderer, ViewOptions, captioned, level, side_by_side, with_legend
+from padgs.data.formats.path_file import read_path
 from padgs.evaluation.images import to_uint8
+from padgs.scene import View, move_origin
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +71,38 @@ def test_cropped_gaussians_are_not_rendered(renderer, anchors):
 def test_side_by_side():
     found = side_by_side(np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 7, np.uint8))
     assert found.shape == (4, 14, 3) and found[0, 0, 0] == 0 and found[0, 7, 0] == 255 and found[0, 13, 0] == 7
+
+
+def test_level_poses_keep_place_and_heading():
+    up, pose = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [100, 20, 30], degrees=True).as_matrix())
+    pose[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    found = level(pose, up)
+    assert torch.allclose(View("", found, 1, 1).center, View("", pose, 1, 1).center)
+    assert torch.allclose(-found[1, :3], up) and torch.allclose(found[:3, :3] @ found[:3, :3].mT, torch.eye(3).double())
+    ahead = pose[2, :3] - (pose[2, :3] @ up) * up
+    assert torch.allclose(found[2, :3], ahead / ahead.norm())
+    pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # straight down
+    assert torch.allclose(level(pose, up)[2, :3], torch.tensor([0.0, 1.0, 0.0]).double())
+
+
+def test_labels_and_legends_cover_corners_only():
+    image = np.zeros((100, 200, 3), np.uint8)
+    assert captioned(image, "run")[:20, :60].max() > 200 and captioned(image, "run")[50:].max() == 0
+    for layer in ("depth", "error"):
+        found = with_legend(image, layer, 2.0, 4.0)
+        assert found[-10:, :60].max() > 200 and found[:50].max() == 0 and not image.any()
+
+
+def test_saved_films_are_paths_in_the_world_of_the_data(tmp_path):
+    client, origin = MagicMock(), torch.tensor([100.0, 0.0, 0.0], dtype=torch.float64)
+    poses = [torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)]
+    poses[1][:3, 3] = torch.tensor([0.0, 0.0, 1.0])
+    film = FilmControls(client, tmp_path, tmp_path, origin, lambda: poses[0], True)
+    film.save()
+    assert "at least two" in film.words.content and not [*tmp_path.iterdir()]
+    film.keyframes.extend(poses)
+    film.save(), film.save()
+    assert {file.name for file in tmp_path.iterdir()} == {"film.json", "film-2.json"}
+    found = move_origin(read_path(tmp_path / "film.json", 2, (0, 0, 1)), origin)
+    assert torch.allclose(found, torch.stack(poses))

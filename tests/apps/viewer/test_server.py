@@ -93,7 +93,7 @@ def test_a_browser_shows_all_controls(run, tmp_path):
         page._layer.value = "error"
         shows("error of")
         page._layer.value, page._camera.value = "depth", "panorama"
-        page._frusta_shown.value = page._crop.value = True
+        page._frusta_shown.value = page._crop.is_on.value = True
         shows()
         view = run.scene.test[0]
         page.go_to(view)

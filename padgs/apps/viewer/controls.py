@@ -1,0 +1,138 @@
+"""Groups of controls of a page: a crop box with handles, and a film of views."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable
+from itertools import count, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from padgs.apps.viewer.renders import Box
+from padgs.files import write_atomically
+from padgs.scene import move_origin
+
+CORNERS = np.array(list(product((0, 1), repeat=3)))
+EDGES = [(a, b) for a in range(8) for b in range(a) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
+CROP_COLOR = (255, 180, 40)
+
+
+class CropControls:
+    """A box whose outside is not rendered: numbers, and handles at two corners."""
+
+    def __init__(self, client: Any, box: Box, model: Path, can_crop: bool, redraw: Callable[[object], None]) -> None:
+        """Add the controls; `box` is the initial one, `model` a run or a file, which commands name."""
+        self._client, self._model, self._redraw, self._shown = client, model, redraw, False
+        size = float(np.ptp(box, axis=0).max())
+        step = size / 200
+        with client.gui.add_folder("crop", expand_by_default=False):
+            self.is_on = client.gui.add_checkbox("crop", initial_value=False, disabled=not can_crop)
+            self.low, self.high = (
+                client.gui.add_vector3(name, tuple(float(f"{step * round(c / step):.6g}") for c in corner), step=step)
+                for name, corner in zip(("lowest", "highest"), box, strict=True)
+            )
+            self._command = client.gui.add_markdown("")
+        self._handles = []
+        for name, corner in (("lowest", self.low), ("highest", self.high)):
+            handle = client.scene.add_transform_controls(
+                f"/crop/{name}", scale=0.08 * size, disable_rotations=True, depth_test=False, visible=False
+            )
+            handle.on_update(lambda _, corner=corner, handle=handle: self._dragged(corner, handle))
+            self._handles.append(handle)
+        self._update()
+        for control in (self.is_on, self.low, self.high):
+            control.on_update(self._update)
+
+    @property
+    def box(self) -> Box | None:
+        """The box, if it is switched on."""
+        return (self.low.value, self.high.value) if self.is_on.value else None
+
+    def show(self, is_perspective: bool) -> None:
+        """Show handles and edges where the page draws them with the lens of the render."""
+        if self._shown != (shown := is_perspective and bool(self.is_on.value)):
+            self._shown = shown
+            self._draw()
+
+    def _dragged(self, corner: Any, handle: Any) -> None:
+        corner.value = tuple(float(f"{c:.6g}") for c in handle.position)
+
+    def _update(self, _: object = None) -> None:
+        box = self.box
+        self._command.content = ""
+        if box is not None and self._model.is_dir():  # padgs export opens runs only
+            numbers = " ".join(f"{c:.6g}" for corner in box for c in corner)
+            self._command.content = f"`padgs export {shlex.quote(str(self._model))} --crop '{numbers}'`"
+        self._draw()
+        self._redraw(None)
+
+    def _draw(self) -> None:
+        corners = np.array((self.low.value, self.high.value), np.float64)
+        if not np.isfinite(corners).all():
+            return
+        for handle, corner in zip(self._handles, corners, strict=True):
+            handle.visible = self._shown
+            if not np.allclose(handle.position, corner):
+                handle.position = corner
+        points = corners[CORNERS, np.arange(3)][np.array(EDGES)]
+        self._client.scene.add_line_segments(
+            "/crop/edges", points, CROP_COLOR, thickness=2.0, thickness_units="screen", visible=self._shown
+        )
+
+
+class FilmControls:
+    """Keyframes of a camera path, saved as a file that `padgs render --path` reads."""
+
+    def __init__(
+        self, client: Any, folder: Path, model: Path, origin: Tensor, pose: Callable[[], Tensor], may_write: bool
+    ) -> None:
+        """Add the controls.
+
+        Args:
+            client: a `viser.ClientHandle`.
+            folder: of the run, or beside a file.
+            model: run or file, as `padgs render` opens it.
+            origin: of the scene in the world of its data set, in which paths are stored.
+            pose: returns the current cam_from_world.
+            may_write: save beside the run; else the browser downloads the file.
+        """
+        self._client, self._folder, self._model, self._origin, self._pose = client, folder, model, origin, pose
+        self._may_write, self.keyframes = may_write, list[Tensor]()
+        with client.gui.add_folder("film", expand_by_default=False):
+            client.gui.add_button("add view").on_click(lambda _: self.change(self.keyframes.append, self._pose()))
+            client.gui.add_button("remove last view").on_click(
+                lambda _: self.change(self.keyframes.pop) if self.keyframes else None
+            )
+            client.gui.add_button("save film").on_click(lambda _: self.save())
+            self.words = client.gui.add_markdown("Add at least two views, then save the film.")
+
+    def change(self, action: Callable[..., object], *arguments: Tensor) -> None:
+        """Change the keyframes, and show their number."""
+        action(*arguments)
+        self.words.content = f"{len(self.keyframes)} views"
+
+    def save(self) -> None:
+        """Save the keyframes in the first free film.json, film-2.json, ... of the run, or let the browser do it."""
+        if len(self.keyframes) < 2:
+            self.words.content = f"{len(self.keyframes)} views; a film needs at least two"
+            return
+        poses = move_origin(torch.stack(self.keyframes), -self._origin.cpu())
+        content = json.dumps({"keyframes": [{"cam_from_world": pose.tolist()} for pose in poses]}, indent=1).encode()
+        if not self._may_write:
+            self._client.send_file_download("film.json", content)
+            self.words.content = "downloaded: `padgs render RUN --path film.json` makes the video"
+            return
+        names = (self._folder / f"film{'' if number == 1 else f'-{number}'}.json" for number in count(1))
+        file = next(name for name in names if not name.exists())
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(file, content)
+        except OSError as error:
+            self.words.content = f"cannot write {file}: {error.strerror or error}"
+            return
+        self.words.content = f"saved. `padgs render {shlex.quote(str(self._model))} --path {shlex.quote(str(file))}`"
