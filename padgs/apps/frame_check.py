@@ -225,7 +225,7 @@ def _closest_points(
     for _ in range(iterations):
         distances, nearest = tree.query(scale * source @ rotation.T + shift)
         kept = distances <= np.quantile(distances, INLIERS)
-        a, b = target[nearest[kept]], source[kept]
+        a, b = target[np.asarray(nearest)[kept]], source[kept]
         u, sizes, vh = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
         signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vh))])
         rotation = u * signs @ vh

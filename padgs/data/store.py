@@ -136,8 +136,10 @@ class ImageStore:
     def _fill(self, image: Decodable, future: Future[Tensor]) -> None:
         """Decode into the cache; an error is raised where the future's result is used."""
         try:
-            on_disk = self.folder if isinstance(image, StoredImage) else None
-            pixels = (image.decode() if on_disk is None else self._stored(image, on_disk)).to(self.device)
+            if self.folder is not None and isinstance(image, StoredImage):
+                pixels = self._stored(image, self.folder).to(self.device)
+            else:
+                pixels = image.decode().to(self.device)
         except BaseException as error:
             with self._lock:
                 del self._pending[image]

@@ -312,6 +312,7 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
         return
     import submitit
     from hydra_plugins.hydra_submitit_launcher.config import BaseQueueConf
+    from submitit.core.utils import FailedJobError
 
     cluster, parameters = launcher._EXECUTOR, dict(launcher.params)
     folder, timeouts = parameters.pop("submitit_folder"), parameters.pop("max_num_timeout", None)
@@ -324,7 +325,7 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
     numbers = range(first_number, first_number + len(jobs))
     try:
         submitted = executor.map_array(launcher, jobs, key, numbers, ids, state)
-    except submitit.core.utils.FailedJobError as error:
+    except FailedJobError as error:
         raise SubmissionRefused(f"Slurm takes no job: {error}") from error
     if cluster == "slurm":
         for position in wait_for_jobs(submitted, board.stop_requested):
