@@ -206,7 +206,7 @@ class Search:
             train=train,
             budget=BudgetOptions(gaussians=None if count == self.rows else count),
             init=WarmStart.of(str(self.run.folder), config.method),
-            run=replace(config.run, folder=folder, pictures=config.run.pictures and hold_out is None, view=False),
+            run=replace(config.run, folder=folder, pictures=config.run.pictures and hold_out is None),
             protocols={RULES.name: TEST_RULES},
             labels=Labels(self._result.preset),
         )

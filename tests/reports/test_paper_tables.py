@@ -171,10 +171,10 @@ def test_the_average_of_an_incomplete_column_is_missing():
 
 def test_other_scenes_have_blocks_of_their_own_with_their_origin():
     room = result("", dataset="synthetic", scene="synthetic-room")
-    outdoor, capture = replace(room, scene="synthetic-outdoor"), replace(room, dataset="", scene="flat")
+    outdoor, capture = replace(room, scene="synthetic-outdoor"), replace(room, dataset="", scene="hall")
     indoor, outdoors = (markdown(build(run_set([room, outdoor, capture]))) for build in (table1, table2))
-    assert "### synthetic-room (generated)" in indoor and "### flat\n" in indoor
-    assert "synthetic-outdoor" in outdoors and "flat" not in outdoors and "synthetic-outdoor" not in indoor
+    assert "### synthetic-room (generated)" in indoor and "### hall\n" in indoor
+    assert "synthetic-outdoor" in outdoors and "hall" not in outdoors and "synthetic-outdoor" not in indoor
     parts = markdown(table3(run_set([replace(row, dataset="synthetic", scene="synthetic-room") for row in FOUR])))
     assert "### synthetic-room" in parts and "| Baseline | 0.786 | 22.30 | 0.257 |" in parts
 

@@ -313,9 +313,9 @@ def test_settings_of_one_method_are_rows_and_a_failed_one_has_no_rank():
 
 
 def test_each_experiment_scene_size_and_length_has_a_block():
-    made = [*ordered(), *ordered("photographs"), *ordered(scene="flat"), *ordered(iterations=7000), *ordered("tau")]
+    made = [*ordered(), *ordered("photographs"), *ordered(scene="atrium"), *ordered(iterations=7000), *ordered("tau")]
     titles = [block.title for block in order(run_set(made)).blocks]
-    starts = ["order: flat", f"order: {ROOM}", f"order: {ROOM}", f"photographs: {ROOM}"]
+    starts = ["order: atrium", f"order: {ROOM}", f"order: {ROOM}", f"photographs: {ROOM}"]
     assert [title.partition(" (")[0] for title in titles] == starts
     assert [title.rpartition(", ")[2] for title in titles[1:3]] == ["1500 iterations", "7000 iterations"]
 
@@ -379,10 +379,10 @@ def test_each_number_of_gaussians_has_a_block_the_fewest_first():
 
 
 def test_a_line_per_run_and_a_block_per_scene():
-    room = replace(result("dagd"), scene="room", dataset="", run="room_padgs_0123456789", counts={"anchors": 1234})
+    room = replace(result("dagd"), scene="hall", dataset="", run="hall_padgs_0123456789", counts={"anchors": 1234})
     text = markdown(runs(run_set([result("full"), failed("baseline", "oom"), room])))
     assert "### 360Roam, bar, 2048x1024, 30000 iterations" in text
-    assert "### room, 2048x1024" in text
+    assert "### hall, 2048x1024" in text
     assert "| padgs, dagd, seed 0, 0123456789 | 23.50 | 0.810 |" in text and "| 1234 |" in text
     assert "| padgs, baseline, seed 0, 0 | OOM | OOM |" in text
 

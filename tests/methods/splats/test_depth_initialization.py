@@ -151,7 +151,7 @@ def test_a_budget_limits_the_number_of_filled_points(monkeypatch):
 def test_the_cloud_is_filled_once_per_run_and_not_when_resuming(monkeypatch):
     sought, scene = [], dome(40)
 
-    def counted(scene, count, *, generator):
+    def counted(scene, count, *, generator, measured):
         sought.append(count)
         torch.rand(1, generator=generator)  # as a choice of pixels does
         return scene
