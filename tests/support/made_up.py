@@ -15,6 +15,7 @@ from padgs.reports.build import table
 from padgs.reports.frame import frame
 from padgs.reports.selection import Request, RunSet
 from padgs.reports.store import Run
+from padgs.reports.table import Table
 from padgs.results import Result, Scores
 
 RULES = {"name": "paper", "lpips": "vgg", "lpips_inputs": "01", "bottom_crop": 0.0}
@@ -222,3 +223,12 @@ def assert_apart(panel: Any, texts: list[Any]) -> None:
     inside = panel.get_window_extent().padded(0.5)
     assert all(inside.contains(*corner) for box in boxes for corner in (box.min, box.max))
     assert not any(first.overlaps(second) for n, first in enumerate(boxes) for second in boxes[:n])
+
+
+def columns(table: Table) -> list[str]:
+    return [column.title for column in table.columns]
+
+
+def value(table: Table, block: str, row: str, column: str) -> float | None:
+    rows = next(b.rows for b in table.blocks if b.title.startswith(block))
+    return next(r for r in rows if r.title == row).cells[columns(table).index(column)].value

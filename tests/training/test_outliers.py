@@ -1,6 +1,7 @@
 """Weights of pixels that are wrong in one training view and right in nearby views."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -44,8 +45,9 @@ def test_views_that_agree_keep_their_weights():
 
 
 def test_what_every_view_shows_differently_from_the_render_keeps_its_weight():
-    inverted = tuple(replace(v, load_pixels=lambda p=v.load_pixels(): 255 - p) for v in tiny_scene().train)
-    target, found = weighted(replace(tiny_scene(), train=inverted))
+    scene = tiny_scene()
+    views = tuple(replace(view, load_pixels=partial(torch.sub, 255, view.load_pixels())) for view in scene.train)
+    target, found = weighted(replace(scene, train=views))
     assert (found.weight / target.weight).median() > 0.9
 
 

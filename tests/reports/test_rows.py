@@ -1,0 +1,72 @@
+"""Rows of single runs, of other programs, of depth, and of scenes that methods were tuned on."""
+
+from dataclasses import replace
+
+import pytest
+from support.made_up import builder, columns, compared, external, failed, result, run_set, small, value
+
+from padgs.reports.writers import markdown
+
+table1, methods, runs = map(builder, ("table1", "methods", "runs"))
+ROOM = "synthetic-room"
+
+
+def test_a_line_per_run_and_a_block_per_scene():
+    room = replace(result("dagd"), scene="hall", dataset="", run="hall_padgs_0123456789", counts={"anchors": 1234})
+    text = markdown(runs(run_set([result("full"), failed("baseline", "oom"), room])))
+    assert "### 360Roam, bar, 2048x1024, 30000 iterations" in text
+    assert "### hall, 2048x1024" in text
+    assert "| padgs, dagd, seed 0, 0123456789 | 23.50 | 0.810 |" in text and "| 1234 |" in text
+    assert "| padgs, baseline, seed 0, 0 | OOM | OOM |" in text
+
+
+def test_rows_of_runs_name_preset_and_changed_keys_and_none_is_the_best():
+    release = result("", method="odgs", preset="odgs_release", psnr=24.0)
+    text = markdown(runs(run_set([result("", method="odgs"), release])))
+    assert "| odgs, seed 0" in text and "| odgs\\_release, seed 0" in text
+    assert "**" not in text and "<ins>" not in text
+    swept = [replace(result(""), run=f"bar_{tau}", config={"method": {"tau": tau}}) for tau in (0.9, 0.5)]
+    (block,) = runs(run_set(swept)).blocks
+    assert [row.title for row in block.rows] == ["padgs, tau 0.5, seed 0, 0.5", "padgs, tau 0.9, seed 0, 0.9"]
+    assert len(runs(run_set(swept, where={"method.tau": "0.5"})).blocks[0].rows) == 1
+
+
+def test_models_of_other_programs_have_rows_beside_the_methods():
+    made = run_set([*compared([ROOM], seeds=3), external(27.5, "my|splat"), external(20.0, "renders")])
+    for build in (methods, table1):
+        (block,) = build(made).blocks
+        assert [row.title for row in block.rows][-2:] == ["my|splat (external)", "renders (external)"]
+    assert value(methods(made), ROOM, "my|splat (external)", "WS-PSNR") == pytest.approx(27.1)
+    assert value(methods(made), ROOM, "my|splat (external)", "iterations") is None
+    text = markdown(methods(made))
+    assert "my\\|splat (external): made by Brush 0.3, and only scored by padgs." in text and "Not ranked" not in text
+    assert [block.title for block in runs(made).blocks][0] == f"{ROOM} (generated), 512x256, made elsewhere"
+
+
+def test_depth_has_columns_where_a_run_was_scored_by_it_and_is_chosen_by_name():
+    one = small(25.0)
+    sphere = replace(
+        one.scores["sphere"], metrics={**one.scores["sphere"].metrics, "abs_rel": 0.05, "delta_1_25": 0.98}
+    )
+    deep = run_set([replace(one, scores={**one.scores, "sphere": sphere})])
+    assert value(methods(deep), ROOM, "PaD-GS", "depth AbsRel") == 0.05
+    assert not any("depth" in title for title in columns(methods(run_set([one]))))
+    chosen = table1(run_set([replace(one, scores={"sphere": sphere})], protocol="sphere", metrics=("delta_1_25",)))
+    assert [column.heading for column in chosen.columns] == ["depth δ < 1.25 ↑"]
+
+
+def test_scenes_tuned_on_and_never_seen_stand_apart():
+    scenes = {"room": "", "flat": "", "plaza": "", "basement": "", "my_house": ""}
+    made = [small(25.0 + n, scene=scene, dataset=of, run=scene) for n, (scene, of) in enumerate(scenes.items())]
+    table = methods(run_set(made))
+    assert [block.title for block in table.blocks] == [
+        "Average over 2 scenes never seen: basement, plaza",
+        "Average over 2 scenes tuned on: flat, room",
+        "basement (never seen)",
+        "plaza (never seen)",
+        "my_house",
+        "flat (tuned on)",
+        "room (tuned on)",
+    ]
+    assert "nobody had trained on it" in "".join(table.notes)
+    assert "tuned" not in markdown(methods(run_set(made[-1:])))
