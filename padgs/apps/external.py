@@ -12,6 +12,7 @@ from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -91,7 +92,7 @@ def is_splat_file(path: str) -> bool:
     return path.lower().endswith(SPLATS) and not Path(path).is_dir()
 
 
-def config_of(data: str, render: RenderConfig | None = None, device: str = "auto", **settings: object) -> RunConfig:
+def config_of(data: str, render: RenderConfig | None = None, device: str = "auto", **settings: Any) -> RunConfig:
     """Return the configuration of a data set: a folder with keys of the `data` group, or a run, whose data it is.
 
     Raises:
@@ -100,7 +101,7 @@ def config_of(data: str, render: RenderConfig | None = None, device: str = "auto
     given = {name: value for name, value in settings.items() if value}
     if not (Path(data) / CONFIG_NAME).is_file():
         protocols = {name: PROTOCOLS[name] for name in ("paper", "sphere")}
-        group = DataConfig(path=data, **{"format": "auto", **given})  # type: ignore[arg-type]
+        group = DataConfig(path=data, **{"format": "auto", **given})
         config = RunConfig(data=group, method=METHOD, options=ExternalOptions(), protocols=protocols)
     elif given:
         raise ValueError(f"--data {data} is a run, which has its own data settings; leave out --{next(iter(given))}")

@@ -179,7 +179,8 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
         costs.append(f"trained {duration(result.timing['train_seconds'])}")
     if "render_ms_median" in result.timing:
         costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
-    costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
+    if result.peak_memory_bytes:  # no training was measured for models of other programs
+        costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
     if result.peak_device_memory_bytes is not None:
         costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
     say(console, ", ".join(costs))
