@@ -32,7 +32,7 @@ ANCHORS = tuple(
 # setting -> overrides that make it small, and grow; how often the host waits in an iteration without growth or
 # checks: once for the pixels, which are not kept there, the rest is of backend torch, the decoder, and random rays
 METHODS = {
-    "padgs": (ANCHORS, 9),
+    "padgs": (ANCHORS, 8),
     "omnigs": (SPLATS, 7),
     "padgs_plus": (("method.gradient_threshold=1e-9",), 5),
     "sc_omnigs": (SPLATS, 7),
