@@ -56,6 +56,7 @@ class ODGSMethod(SplatMethod):
 
     Options = ODGSOptions
     MODEL = ODGSModel
+    RUN_RATES = "run_linear"
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()

@@ -28,7 +28,7 @@ WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
-LINEAR, LINEAR_ITERATIONS = ("omnigs", "op43dgs"), 3000  # methods with a law of their own for learning rates
+LINEAR, LINEAR_ITERATIONS = ("omnigs", "odgs", "op43dgs"), 3000  # methods with a law of their own for learning rates
 LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.targets`, without torch
 
 
