@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from padgs.cli.errors import check_range, show
+from padgs.cli.prepare import CameraHeight, Gps, Metres
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
 SOURCES = "metashape, e57, navvis, roam360, ricoh360, omniblender, ob3d, tartanair"  # besides
@@ -24,6 +25,9 @@ def convert(
     mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
     depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+    metres: Metres = None,
+    camera_height: CameraHeight = None,
+    gps: Gps = False,
 ) -> None:
     """Write a data set in another format. Exit code 1, and nothing written, if that is impossible."""
     from pathlib import Path
@@ -32,6 +36,7 @@ def convert(
 
     from padgs.data.capture import DataOptions
     from padgs.data.formats.convert import convert as write
+    from padgs.data.metres import KnownLength
 
     check_range(0, 65536, width=width)
     with Console().status("reading") as status:
@@ -41,6 +46,7 @@ def convert(
             to,
             format=format,
             options=DataOptions(width=width or None, points=points, mask=mask, depth=depth, split=split),
+            known=KnownLength(metres, camera_height, gps),
             progress=lambda done, total: status.update(f"image {done} of {total}"),
         )
     for note in scene.notes:

@@ -25,19 +25,34 @@ WORDS = {
 }
 
 
+Metres = Annotated[
+    tuple[str, str, float] | None,
+    typer.Option(metavar="A B DISTANCE", help="scale the world: panoramas A and B were taken DISTANCE metres apart"),
+]
+CameraHeight = Annotated[
+    float | None, typer.Option(help="scale the world: metres from the floor, which must be seen, to the cameras")
+]
+Gps = Annotated[bool, typer.Option("--gps", help="scale and turn the world by the GPS in the EXIF of the images")]
+
+
 def prepare(
     source: Annotated[str, typer.Argument(help="folder of panoramas, or a stitched 360-degree video")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
     accurate: Annotated[
         bool, typer.Option("--accurate", help="features in undistorted views; about 5x slower")
     ] = False,
-    pairs: Annotated[str, typer.Option(help="auto, exhaustive, or sequential: names in the order taken")] = "auto",
+    pairs: Annotated[
+        str, typer.Option(help="auto, exhaustive, sequential (names in the order taken) or similar")
+    ] = "auto",
     mask: Annotated[
         str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder; 255 = use")
     ] = "auto",
     level: Annotated[bool, typer.Option(help="turn the world so that the cameras' common up is +z")] = True,
     per_second: Annotated[float, typer.Option(help="frames kept per second of video")] = 2.0,
     seed: Annotated[int, typer.Option(help="of all random choices")] = 0,
+    metres: Metres = None,
+    camera_height: CameraHeight = None,
+    gps: Gps = False,
     threads: Annotated[
         int,
         typer.Option(help="processor threads; 0 = all, at most 8, as free memory allows; fewer take less memory"),
@@ -48,6 +63,7 @@ def prepare(
 
     from padgs.cli.check import end_with, overlay_path
     from padgs.data.check import check
+    from padgs.data.metres import KnownLength
     from padgs.data.prepare.pipeline import prepare as find_poses
     from padgs.data.prepare.work import PrepareOptions
 
@@ -57,7 +73,8 @@ def prepare(
     target = Path(destination)
     try:
         with _bars() as tell:
-            options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
+            known = KnownLength(metres, camera_height, gps)
+            options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, known, threads)
             result = find_poses(Path(source), target, options, tell)
             report = check(target, overlay=overlay_path(target))
     except KeyboardInterrupt as interrupt:

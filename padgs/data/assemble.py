@@ -15,6 +15,7 @@ from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
 from padgs.data.masks import find_masks, masks_beside
+from padgs.data.metres import unit_note
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage, cache_root
 from padgs.scene import Scene, View
@@ -39,7 +40,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     refuse_clashes(names)
     _refuse_missing(capture)
     images = [inspect(frame.image) for frame in capture.frames]
-    notes = [*capture.notes, *_camera_notes(capture.frames, images), *notes_on(images)]
+    notes = [*capture.notes, *unit_note(capture.folder), *_camera_notes(capture.frames, images), *notes_on(images)]
     target = options.width
     if target is None and capture.width is not None and images[0].width > capture.width:
         target = capture.width

@@ -204,8 +204,8 @@ def _stated(file: Path, is_png: bool) -> DepthMeaning:
     return DepthMeaning(measure, float(unit), file.name)
 
 
-def write_depths(views: Sequence[View], folder: Path) -> None:
-    """Write the depth maps of views, if any has one, into `depths/` of a data set's folder."""
+def write_depths(views: Sequence[View], folder: Path, unit: float = 1.0) -> None:
+    """Write the depth maps of views, if any has one, into `depths/` of a folder whose world has `unit` per unit."""
     known = [view for view in views if view.load_depth is not None]
     for view in known:
         assert view.load_depth is not None
@@ -214,4 +214,4 @@ def write_depths(views: Sequence[View], folder: Path) -> None:
         np.save(file, view.load_depth().numpy())
     if known:
         measure = RELATIVE[0] if known[0].depth_is_relative else "ray"
-        (folder / FOLDERS[0] / STATEMENT).write_text(json.dumps({"measure": measure, "unit": 1}))
+        (folder / FOLDERS[0] / STATEMENT).write_text(json.dumps({"measure": measure, "unit": unit}))

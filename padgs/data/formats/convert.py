@@ -17,6 +17,7 @@ from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import inspect, save_png
 from padgs.data.masks import write_masks
+from padgs.data.metres import KnownLength, to_metres, unit_note, write_unit
 from padgs.files import draft_of
 from padgs.scene import Scene
 
@@ -28,6 +29,7 @@ def convert(
     *,
     format: str = "auto",
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
+    known: KnownLength = KnownLength(),  # noqa: B008
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scene:
     """Write a data set in another format.
@@ -41,6 +43,7 @@ def convert(
         to: a name of `padgs.data.formats.writers.WRITERS`.
         format: of the source, or auto.
         options: as for `padgs.data.load`.
+        known: what sets the scale of the written world.
         progress: called with (images written, total).
 
     Returns:
@@ -65,8 +68,17 @@ def convert(
                 # In the world of the poses: the scene may be recentered.
                 points, colors, _ = initial_cloud(capture, options.points)
                 content = replace(content, cloud=Cloud(points, colors), tracks=None)
+            scale = 1.0
+            if found := to_metres(content.frames, content.cloud, known):
+                change, note = found
+                scale, cloud = change.scale, content.cloud and change.cloud(content.cloud)
+                content = replace(content, frames=change.frames(content.frames), cloud=cloud)
+                scene = replace(scene, notes=(*scene.notes, note))
+                write_unit(partial, note)
+            elif notes := unit_note(capture.folder):
+                write_unit(partial, notes[0])
             write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
-            write_depths((*scene.train, *scene.test), partial)
+            write_depths((*scene.train, *scene.test), partial, scale)
             WRITERS[to](content, partial)
             if destination.exists():
                 destination.rmdir()

@@ -7,7 +7,7 @@ when it is complete.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -26,8 +26,9 @@ from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
+from padgs.data.metres import UPRIGHT, WorldChange, rotation_to_z, to_metres, write_unit
 from padgs.data.prepare import rig, sfm
-from padgs.data.prepare.sfm import image_pairs
+from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
 from padgs.data.prepare.work import (
     LOCK,
@@ -47,6 +48,8 @@ _REMEDIES = (
     "take them closer together (of a video: --per-second), hide what moves with the camera in a mask (--mask), or try "
     "--accurate"
 )
+
+_LATE = ("threads", "level", "known")  # options without influence on what the working folder keeps
 
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, total)
 
@@ -133,18 +136,18 @@ class _Job:
         self.folder = WorkFolder(work)
         given = None
         if is_video(source):
-            given = digest_of(fingerprint(source, options), options)
-            self.folder.open("video", given)
+            of_video = fingerprint(source, options)
+            given = digest_of(of_video, options)
+            self.folder.open("video", digest_of(of_video, options, _LATE))
             self.folder.run_once("frames", partial(self._extract_frames, source))
             source = self.work / "frames"
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
         first = next(iter(self.source.images.values()))
         self.threads = options.threads or threads_for(first.width, first.height)
-        of_video = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
-        of_images = digest_of(self.source.fingerprint, options)
-        self.folder.open("images", of_images, keep=of_video)
-        self.input = given or of_images
+        kept = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
+        self.folder.open("images", digest_of(self.source.fingerprint, options, _LATE), keep=kept)
+        self.input = given or digest_of(self.source.fingerprint, options)
         # Short names, because pycolmap's list of pairs does not support spaces.
         self.files = {
             f"{index:06d}{_suffix(image)}": name for index, (name, image) in enumerate(self.source.images.items())
@@ -212,12 +215,14 @@ class _Job:
         return [sfm.Group(tuple(names), *size) for size, names in by_size.items()]
 
     def _match(self) -> None:
-        short = {name: short for short, name in self.files.items()}
-        # Sorted by the original names, in natural order.
-        pairs = [[(short[a], short[b])] for a, b in image_pairs(list(short), self.options.pairs)]
+        views = {name: [short] for short, name in self.files.items()}  # original name -> images with features
         if self.options.accurate:
-            both = list(product(range(self.views), repeat=2))
-            pairs = [[(rig.view_name(i, a), rig.view_name(j, b)) for i, j in both] for [(a, b)] in pairs]
+            views = {name: [rig.view_name(i, short) for i in range(self.views)] for name, [short] in views.items()}
+
+        def similarity(names: Sequence[str]) -> np.ndarray:
+            return similarities(self.database, [views[name] for name in names], self.options.seed)
+
+        pairs = [[*product(views[a], views[b])] for a, b in image_pairs(list(views), self.options.pairs, similarity)]
         progress = partial(self._progress, "matches")
         sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, progress)
 
@@ -233,10 +238,17 @@ class _Job:
         model, *others = sorted(parts, key=lambda part: -part.num_reg_frames())
         sfm.refine(model, self.threads)
         frames, cloud, tracks = self._panoramas(model)
-        notes = list(self.source.notes)
+        notes, partial_folder = list(self.source.notes), self.folder.empty("out")
         if self.options.level:
             frames, cloud, note = level_world(frames, cloud)
             notes.append(note)
+        if found := to_metres(frames, cloud, self.options.known):
+            change, note = found
+            frames, cloud = change.frames(frames), change.cloud(cloud)
+            write_unit(partial_folder, note)
+            notes.append(note)
+        else:
+            notes.append("the scale of the world is arbitrary: --metres, --camera-height and --gps set it")
         registered = tuple(frame.name for frame in frames)
         unregistered = tuple(name for name in self.files.values() if name not in set(registered))
         if unregistered:
@@ -250,7 +262,6 @@ class _Job:
         result = Prepared(
             self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), seconds, tuple(notes)
         )
-        partial_folder = self.folder.empty("out")
         for frame in frames:
             target = partial_folder / "images" / frame.name
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -298,19 +309,10 @@ def _pycolmap_message(error: Exception, log: Path) -> str:
     return "; ".join(dict.fromkeys(line.rpartition("] ")[2] for line in messages))
 
 
-LEVEL_AGREEMENT = 0.9  # minimal length of the mean of the cameras' up directions
-
-
 def level_world(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
     """Rotate the world so that +z is the cameras' common up, if they have one; also returns a note."""
     estimate = gravity(torch.stack([frame.cam_from_world for frame in frames]))
-    if estimate.agreement < LEVEL_AGREEMENT:
+    if estimate.agreement < UPRIGHT:
         return frames, cloud, "the cameras have no common up direction; the world is not rotated"
-    from scipy.spatial.transform import Rotation
-
-    new_from_old = torch.from_numpy(Rotation.align_vectors([(0.0, 0.0, 1.0)], [estimate.up])[0].as_matrix())
-    old_from_new = torch.eye(4, dtype=torch.float64)
-    old_from_new[:3, :3] = new_from_old.mT
-    frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ old_from_new) for frame in frames)
-    cloud = Cloud(cloud.points @ new_from_old.mT, cloud.colors)
-    return frames, cloud, "the world's +z is the cameras' common up direction; its scale is arbitrary"
+    change = WorldChange(rotation=rotation_to_z(torch.tensor(estimate.up, dtype=torch.float64)))
+    return change.frames(frames), change.cloud(cloud), "the world's +z is the cameras' common up direction"

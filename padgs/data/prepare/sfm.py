@@ -1,4 +1,4 @@
-"""Structure from motion with pycolmap, step by step: pairs, features, matches, poses, and a final robust refinement.
+"""Structure from motion with pycolmap, step by step: features, matches, poses, and a final robust refinement.
 
 Features and matches are computed in batches, which gives progress and resumes from the database. pycolmap logs to the
 process's standard error and ignores its own switches; `log_to` redirects that.
@@ -11,36 +11,10 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from padgs.data.capture import natural_key
 from padgs.data.formats.colmap import pycolmap_module
-
-PAIRS = ("auto", "exhaustive", "sequential")
-EXHAUSTIVE_UP_TO = 80  # images: 3160 pairs
-_NEIGHBOURS = 10  # following images in natural order
-_LOOP_IMAGES = 30  # spread over the sequence and all matched with each other, for loop closure
-
-
-def image_pairs(names: Sequence[str], kind: str = "auto") -> list[tuple[str, str]]:
-    """Return pairs of names to match, each once.
-
-    `sequential` sorts the names naturally and pairs every image with the next ten and with those 16, 32, 64, ...
-    further on. For loop closure, 30 images spread over the sequence are also matched with each other.
-
-    >>> image_pairs(["a", "b", "c"])
-    [('a', 'b'), ('a', 'c'), ('b', 'c')]
-    """
-    names = sorted(names, key=natural_key)
-    if kind == "exhaustive" or (kind == "auto" and len(names) <= EXHAUSTIVE_UP_TO):
-        return list(combinations(names, 2))
-    steps = [*range(1, _NEIGHBOURS + 1), *(2**k for k in range(4, 32) if 2**k < len(names))]
-    near = {(i, i + step) for i in range(len(names)) for step in steps if i + step < len(names)}
-    loop = sorted({round(k * (len(names) - 1) / (_LOOP_IMAGES - 1)) for k in range(_LOOP_IMAGES)})
-    return [(names[i], names[j]) for i, j in sorted(near | set(combinations(loop, 2)))]
-
 
 Progress = Callable[[int, int], None]  # (done, total)
 
@@ -188,15 +162,8 @@ def reconstruct(
         placed = number
         progress(min(placed, total), total)
 
-    found_parts = pycolmap.incremental_mapping(
-        database,
-        folder,
-        parts,
-        options,
-        initial_image_pair_callback=lambda: tell(2),
-        next_image_callback=lambda: tell(placed + 1),
-    )
-    return len(found_parts)
+    callbacks = {"initial_image_pair_callback": lambda: tell(2), "next_image_callback": lambda: tell(placed + 1)}
+    return len(pycolmap.incremental_mapping(database, folder, parts, options, **callbacks))
 
 
 def refine(model: Any, threads: int) -> None:

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +19,8 @@ from pathlib import Path
 from padgs.data.assemble import PREPARED
 from padgs.data.capture import DataError
 from padgs.data.masks import mask_path
-from padgs.data.prepare.sfm import PAIRS
+from padgs.data.metres import KnownLength
+from padgs.data.prepare.pairs import PAIRS
 from padgs.data.prepare.sources import find_source, is_video
 
 LOCK = ".lock"  # of the process that works in the folder
@@ -71,11 +72,12 @@ class PrepareOptions:
     """Options of `padgs prepare`."""
 
     accurate: bool = False  # features in perspective views: slower, better near the poles
-    pairs: str = "auto"  # auto | exhaustive | sequential (names in the order they were taken)
+    pairs: str = "auto"  # auto | exhaustive | sequential (names in the order they were taken) | similar
     mask: str = "auto"  # auto (mask.png or masks/ with the images) | none | rows:959/1024 | a file or folder
     level: bool = True  # rotate the world so that the cameras' common up is +z
     per_second: float = 2.0  # frames kept of a video
     seed: int = 0
+    known: KnownLength = KnownLength()  # sets the scale of the world
     threads: int = 0  # 0 = one per processor, at most 8, limited by free memory
 
     def __post_init__(self) -> None:
@@ -129,9 +131,9 @@ def fingerprint(source: Path, options: PrepareOptions) -> str:
     return "|".join(digests)
 
 
-def digest_of(fingerprint: str, options: PrepareOptions) -> str:
+def digest_of(fingerprint: str, options: PrepareOptions, without: Sequence[str] = ("threads",)) -> str:
     """Return a digest of an input and all options that affect the result."""
-    relevant = {key: value for key, value in asdict(options).items() if key != "threads"}
+    relevant = {key: value for key, value in asdict(options).items() if key not in without}
     return hashlib.sha256(json.dumps([fingerprint, relevant], sort_keys=True).encode()).hexdigest()
 
 

@@ -4,30 +4,53 @@ import errno
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from padgs.data.capture import Cloud, Frame
+from padgs.data.formats.colmap import pycolmap_module
 from padgs.data.prepare import work
+from padgs.data.prepare.pairs import EXHAUSTIVE_UP_TO, image_pairs, similarities
 from padgs.data.prepare.pipeline import level_world
-from padgs.data.prepare.sfm import EXHAUSTIVE_UP_TO, image_pairs
+from padgs.data.prepare.sfm import Group, _register
 
 NAMES = [f"{index:04d}" for index in range(500)]
+
+
+def ring(names: list[str]) -> np.ndarray:
+    """Return similarities of places on a circle."""
+    angle = 2 * np.pi * np.array([int(name) for name in names]) / len(names)
+    return np.cos(angle[:, None] - angle)
 
 
 def test_few_images_are_paired_exhaustively_and_many_sequentially_with_loop_closure():
     pairs = image_pairs(NAMES[:EXHAUSTIVE_UP_TO])
     assert len(pairs) == len(set(pairs)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) // 2
     assert image_pairs(NAMES[:200], "exhaustive")[-1] == ("0198", "0199")
-    pairs = set(image_pairs(NAMES))
+    pairs = set(image_pairs(NAMES, "auto", ring))
     assert len(pairs) < 20 * len(NAMES)
     assert all(a < b for a, b in pairs)
     for step in (*range(1, 11), 16, 32, 64, 128, 256):
         assert ("0100", f"{100 + step:04d}") in pairs
-    assert ("0100", "0111") not in pairs
+    assert ("0100", "0111") not in pairs and ("0000", "0299") in image_pairs(NAMES[:300], "similar", ring)
     assert ("0000", "0499") in pairs  # a path that comes back to its start
-    assert image_pairs(NAMES[::-1]) == image_pairs(NAMES)
+    assert image_pairs(NAMES[::-1], "auto", ring) == image_pairs(NAMES, "auto", ring)
+
+
+def test_panoramas_with_the_same_features_are_similar(tmp_path):
+    pycolmap, random = pycolmap_module(), np.random.default_rng(0)
+    sift, names = pycolmap.FeatureExtractorType.SIFT, [f"{k}.png" for k in range(6)]
+    _register(tmp_path / "a.db", [Group(tuple(names), 64, 32)])
+    places = random.integers(0, 256, (2, 80, 128))
+    with pycolmap.Database.open(tmp_path / "a.db") as entries:
+        for k, image in enumerate(entries.read_all_images()):
+            seen = random.permutation(places[k % 2])[:50] + random.integers(-9, 10, (50, 128))
+            found = np.clip(seen, 0, 255).astype(np.uint8)
+            entries.write_descriptors(image.image_id, pycolmap.FeatureDescriptors(sift, found))
+    alike = similarities(tmp_path / "a.db", [[name] for name in names], seed=0)
+    assert alike[0, [2, 4]].min() > 2 * alike[0, [1, 3, 5]].max()
 
 
 def test_names_are_sorted_naturally():

@@ -1,0 +1,250 @@
+"""Worlds in metres: the scale by a known distance of two cameras, by the height of the cameras, or by GPS.
+
+`to_metres` finds the similarity that maps a world to metres; `write_unit` states the unit beside a data set.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from PIL import ExifTags
+from torch import Tensor
+
+from padgs.data.camera_paths import centers, gravity
+from padgs.data.capture import Cloud, DataError, Frame, listed
+from padgs.files import open_image
+
+UNIT = "unit.json"
+UPRIGHT = 0.9  # minimal length of the mean of the cameras' up directions
+_FLOOR = 0.03  # half of the layer that is taken for the floor, relative to the height of the cameras
+_MIN_FLOOR_POINTS, _MIN_FLOOR_SHARE = 30, 0.02  # in that layer, and of the points below the cameras
+_MAX_DEEPER = 0.05  # share of the points below the cameras that may lie below the floor
+_MIN_ABOVE_FLOOR = 0.7  # share of the cameras that have a point of the floor within their height, horizontally
+_MAX_HEIGHTS = 0.15  # standard deviation of the cameras' heights, relative to their median
+_MIN_SPREAD = 3.0  # metres, of GPS positions: their root mean square distance from their mean
+_MAX_RESIDUAL = 0.15  # root mean square distance of cameras from their GPS positions, relative to that spread
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """Known length in metres; at most one of these."""
+
+    metres: tuple[str, str, float] | None = None  # two cameras, and their distance
+    camera_height: float | None = None  # above the floor
+    gps: bool = False  # by the EXIF of the images
+
+    def __post_init__(self) -> None:
+        if (self.metres is not None) + (self.camera_height is not None) + self.gps > 1:
+            raise DataError("give one of --metres, --camera-height and --gps, as each sets the scale")
+        length = self.camera_height if self.metres is None else self.metres[2]
+        if length is not None and not 0 < length < math.inf:
+            option = "--camera-height" if self.metres is None else "the distance of --metres"
+            raise DataError(f"{option} is {length:g}; it must be a finite number of metres above 0")
+
+
+@dataclass(frozen=True)
+class WorldChange:
+    """Similarity of worlds: x_new = scale * rotation @ x_old + shift."""
+
+    scale: float = 1.0
+    rotation: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
+    shift: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+
+    def frames(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+        """Return frames with their poses in the new world."""
+        moved = []
+        for frame in frames:
+            pose = frame.cam_from_world.double().clone()
+            pose[:3, :3] = pose[:3, :3] @ self.rotation.mT
+            pose[:3, 3] = self.scale * pose[:3, 3] - pose[:3, :3] @ self.shift
+            moved.append(replace(frame, cam_from_world=pose))
+        return tuple(moved)
+
+    def cloud(self, cloud: Cloud) -> Cloud:
+        """Return points in the new world."""
+        return Cloud(self.scale * cloud.points.double() @ self.rotation.mT + self.shift, cloud.colors)
+
+
+def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) -> tuple[WorldChange, str] | None:
+    """Return the change to a world in metres, and a note on the scale; None if no length is known.
+
+    With GPS, x is east, y north and z up, from the mean of the cameras' positions.
+
+    Raises:
+        DataError: the scale does not follow from what is known; the message says by which numbers.
+    """
+    poses = torch.stack([frame.cam_from_world for frame in frames])
+    if known.metres is not None:
+        change, note = _by_distance(frames, poses, *known.metres)
+    elif known.camera_height is not None:
+        change, note = _by_height(poses, cloud, known.camera_height)
+    elif known.gps:
+        change, note = _by_gps(frames, poses)
+    else:
+        return None
+    return change, f"lengths are in metres, {note}; before: times {change.scale:.6g}"
+
+
+def write_unit(folder: Path, note: str) -> None:
+    """State that the data set in a folder is in metres."""
+    (folder / UNIT).write_text(json.dumps({"unit": "metre", "note": note}, indent=2) + "\n", encoding="utf-8")
+
+
+def unit_note(folder: Path) -> list[str]:
+    """Return the note of `write_unit` in a folder, if there is one."""
+    try:
+        note = json.loads((folder / UNIT).read_text(encoding="utf-8"))["note"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [note] if isinstance(note, str) else []
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix(""))
+
+
+def _by_distance(
+    frames: Sequence[Frame], poses: Tensor, first: str, second: str, metres: float
+) -> tuple[WorldChange, str]:
+    names = {name: k for k, frame in enumerate(frames) for name in (frame.name, _stem(frame.name))}
+    at = [names.get(name, names.get(_stem(name))) for name in (first, second)]  # "convert" may change the extension
+    for name, index in zip((first, second), at, strict=True):
+        if index is None:
+            known = listed(frame.name for frame in frames)
+            raise DataError(f"--metres: no panorama with a pose is called {name!r}; known: {known}")
+    distance = (centers(poses)[at[0]] - centers(poses)[at[1]]).norm().item()
+    extent = (centers(poses) - centers(poses).mean(0)).norm(dim=1).max().item()
+    if distance <= 1e-6 * extent:
+        raise DataError(f"--metres: {first} and {second} were taken at one place; name two cameras far apart")
+    return WorldChange(metres / distance), f"by {metres:g} m between {first} and {second}"
+
+
+def _common_up(poses: Tensor, option: str) -> Tensor:
+    estimate = gravity(poses)
+    if estimate.agreement < UPRIGHT:
+        raise DataError(
+            f"{option}: the cameras have no common up direction (agreement {estimate.agreement:.2f}, and at least "
+            f"{UPRIGHT:g} is needed); use --metres A B DISTANCE"
+        )
+    return torch.tensor(estimate.up, dtype=torch.float64)
+
+
+def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[WorldChange, str]:
+    """Find the floor: the fullest layer of points below the cameras, under most cameras and with little below it."""
+    instead = "; use --metres A B DISTANCE"
+    if cloud is None:
+        raise DataError(f"--camera-height: there are no points to find the floor by{instead}")
+    level = rotation_to_z(_common_up(poses, "--camera-height"))
+    points, cameras = cloud.points.double() @ level.mT, centers(poses) @ level.mT
+    points = points[points[:, 2] < cameras[:, 2].median()]
+    points = points[points[:, 2].argsort(descending=True)]
+    below = (cameras[:, 2].median() - points[:, 2]).numpy()
+    # In the layer around a depth d: those from (1 - f) d to (1 + f) d.
+    low, high = (np.searchsorted(below, below * factor) for factor in (1 - _FLOOR, 1 + _FLOOR))
+    inside, deeper = high - low, len(below) - high
+    fits = (inside >= max(_MIN_FLOOR_POINTS, _MIN_FLOOR_SHARE * len(below))) & (deeper <= _MAX_DEEPER * len(below))
+    if not fits.any():
+        raise DataError(
+            f"--camera-height: no floor was found: of the {len(below)} points below the cameras, no layer with at most "
+            f"{_MAX_DEEPER:.0%} below it holds {_MIN_FLOOR_POINTS} and {_MIN_FLOOR_SHARE:.0%}{instead}"
+        )
+    best = int(np.argmax(np.where(fits, inside, 0)))
+    height = float(np.median(below[low[best] : high[best]]))
+    near = torch.cdist(cameras[:, :2], points[low[best] : high[best], :2]).amin(1) < height
+    if near.double().mean() < _MIN_ABOVE_FLOOR:
+        raise DataError(
+            f"--camera-height: no floor was found: the lowest layer, of {inside[best]} points, lies under only "
+            f"{near.sum()} of {len(near)} cameras, so that it may be a table{instead}"
+        )
+    heights = (cameras[:, 2] - cameras[:, 2].median()).square().mean().sqrt().item() / height
+    if heights > _MAX_HEIGHTS:
+        raise DataError(
+            f"--camera-height: the cameras' heights differ by {heights:.0%} (at most {_MAX_HEIGHTS:.0%}), so that not "
+            f"all are {metres:g} m above one floor{instead}"
+        )
+    return WorldChange(metres / height), f"by cameras {metres:g} m above the floor ({inside[best]} points)"
+
+
+def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[WorldChange, str]:
+    """Fit heading, scale and place of the world, upright by the cameras, to east, north and up."""
+    found = [(k, place) for k, frame in enumerate(frames) if (place := gps_of(frame.image)) is not None]
+    instead = "; use --metres A B DISTANCE or --camera-height"
+    if (different := len({place[:2] for _, place in found})) < 3:
+        raise DataError(
+            f"--gps: {len(found)} of {len(frames)} images have a GPS position, {different} different ones, and "
+            f"at least 3 are needed{instead}"
+        )
+    origin, truth = local_metres([place for _, place in found])
+    level = rotation_to_z(_common_up(poses, "--gps"))
+    used = centers(poses)[[k for k, _ in found]]
+    at = used @ level.mT
+    theirs, ours = (torch.complex(of[:, 0], of[:, 1]) for of in (truth, at))
+    theirs, ours = theirs - theirs.mean(), ours - ours.mean()
+    spread = theirs.abs().square().mean().sqrt().item()
+    turn = (ours.conj() * theirs).sum() / ours.abs().square().sum()
+    residual = (turn * ours - theirs).abs().square().mean().sqrt().item()
+    if not spread >= _MIN_SPREAD:
+        raise DataError(
+            f"--gps: the positions spread by {spread:.2g} m, and at least {_MIN_SPREAD:g} m are needed{instead}"
+        )
+    if not residual <= _MAX_RESIDUAL * spread:
+        raise DataError(
+            f"--gps: cameras are {residual:.2g} m from their GPS positions (root mean square), more than "
+            f"{_MAX_RESIDUAL:.0%} of the spread of {spread:.3g} m; the fit is poor{instead}"
+        )
+    scale, angle = turn.abs().item(), turn.angle().item()
+    c, s = math.cos(angle), math.sin(angle)
+    rotation = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64) @ level
+    change = WorldChange(scale, rotation, truth.mean(0) - scale * rotation @ used.mean(0))
+    where = ", ".join(f"{value:.7g}" for value in origin)
+    return change, (
+        f"by GPS of {len(found)} images, {residual:.2g} m from the fit; x is east, y north, z up from latitude, "
+        f"longitude, altitude {where}"
+    )
+
+
+def rotation_to_z(up: Tensor) -> Tensor:
+    """Return the smallest rotation [3, 3] that maps a direction [3] to +z."""
+    from scipy.spatial.transform import Rotation
+
+    return torch.from_numpy(Rotation.align_vectors([(0.0, 0.0, 1.0)], [up.tolist()])[0].as_matrix())
+
+
+def gps_of(image: Path) -> tuple[float, float, float] | None:
+    """Return latitude and longitude in degrees, and altitude in metres (0 if unknown), by EXIF; None without GPS."""
+    with open_image(image) as opened:
+        tags = opened.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+    try:
+        angles = [
+            sum(float(part) / 60**k for k, part in enumerate(tags[value])) * (-1 if str(tags[side])[:1] in "SW" else 1)
+            for value, side in (
+                (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef),
+                (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef),
+            )
+        ]
+        altitude = float(tags.get(ExifTags.GPS.GPSAltitude, 0.0))
+        if tags.get(ExifTags.GPS.GPSAltitudeRef) in (b"\x01", 1):  # below the sea
+            altitude = -altitude
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    is_place = all(map(math.isfinite, (*angles, altitude))) and abs(angles[0]) <= 90 and abs(angles[1]) <= 180
+    return (angles[0], angles[1], altitude) if is_place and any(angles) else None
+
+
+def local_metres(places: Sequence[tuple[float, float, float]]) -> tuple[tuple[float, float, float], Tensor]:
+    """Return the mean place, and east, north and up [n, 3] of all in metres from it, by the radii of WGS 84 there."""
+    degrees = np.array(places)
+    origin = degrees.mean(0)
+    latitude = math.radians(origin[0])
+    axis, flat = 6_378_137.0, 0.006_694_379_990_141  # semi-major axis in metres, squared eccentricity
+    bulge = 1 - flat * math.sin(latitude) ** 2
+    north = axis * (1 - flat) / bulge**1.5 + origin[2]
+    east = (axis / bulge**0.5 + origin[2]) * math.cos(latitude)
+    metres = (degrees - origin)[:, [1, 0, 2]] * (math.radians(east), math.radians(north), 1.0)
+    return tuple(origin.tolist()), torch.from_numpy(metres)
