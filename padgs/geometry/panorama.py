@@ -161,14 +161,18 @@ def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:
     """
     height, width = image.shape[:2]
     image = image if image.is_floating_point() else image.float()
+    flat = image.reshape(height * width, -1)
     u, v = (pixels - 0.5).unbind(-1)
     column, row = u.detach().floor().long(), v.detach().floor().long()
     across, down = (u - column)[..., None].to(image), (v - row)[..., None].to(image)
 
-    def at(row: Tensor, column: Tensor) -> Tensor:
-        beyond = (row < 0) | (row >= height)  # a pole: the next row is the same row, half a turn further
-        column = torch.where(beyond, column + width // 2, column) % width
-        return image[row.clamp(0, height - 1), column]
+    def at(start: Tensor, column: Tensor) -> Tensor:
+        return flat.index_select(0, (start + column).flatten()).reshape(*column.shape, -1)
 
-    above = at(row, column).lerp(at(row, column + 1), across)
-    return above.lerp(at(row + 1, column).lerp(at(row + 1, column + 1), across), down)
+    def line(row: Tensor) -> Tensor:
+        beyond = (row < 0) | (row >= height)  # a pole: the next row is the same row, half a turn further
+        left = torch.where(beyond, column + width // 2, column) % width
+        start = row.clamp(0, height - 1) * width
+        return at(start, left).lerp(at(start, (left + 1) % width), across)
+
+    return line(row).lerp(line(row + 1), down)

@@ -33,6 +33,7 @@ class Trainer:
         schedule: length of the schedule, in steps.
         step: last schedule step; `iteration` unless the budget is in seconds or part of the schedule was skipped.
         step_seconds: duration of the last iteration, on the clock of the budget.
+        began: seconds before the first iteration, on the clock of the budget.
         start: number of Gaussians, anchors or other parts at the beginning.
         skipped, ended: schedule steps that `request_stop` skipped, and its reason.
         corrections: learned exposures, poses and lens of the training views.
@@ -41,7 +42,18 @@ class Trainer:
     """
 
     ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.999), "eps": 1e-15}  # as 3DGS: gradients of a Gaussian are tiny
-    PROGRESS = ("iteration", "step", "schedule", "seconds", "cpu_seconds", "step_seconds", "start", "skipped", "ended")
+    PROGRESS = (
+        "iteration",
+        "step",
+        "schedule",
+        "seconds",
+        "cpu_seconds",
+        "step_seconds",
+        "began",
+        "start",
+        "skipped",
+        "ended",
+    )
 
     def __init__(
         self,
@@ -65,7 +77,7 @@ class Trainer:
         self.iteration = self.step = self.skipped = 0
         self.ended = ""
         self.schedule = budget.iterations
-        self.seconds = self.cpu_seconds = self.step_seconds = 0.0
+        self.seconds = self.cpu_seconds = self.step_seconds = self.began = 0.0
         self.start = next(iter(model.counts().values()))
         self._model, self._budget, self._options, self._stage = model, budget, options, stage
         self._views_each = views_each
@@ -92,7 +104,7 @@ class Trainer:
         budget, limit = self._budget, self._budget.max_seconds
         while self.step < budget.iterations and (limit is None or self.seconds < limit):
             lap, iteration = Lap(), self.iteration + 1
-            step = budget.next_step(self.step, self.spent, self.step_seconds, self.skipped)
+            step = budget.next_step(self.step, self.spent, self.step_seconds, skipped=self.skipped, began=self.began)
             self._monitor.begin(step, self._views.halvings(step / self.schedule), iteration)
             with out_of_memory_as_failure(iteration):
                 loss, sizes = self._gradients(iteration, step)

@@ -116,6 +116,7 @@ class Method(ABC):
         else:
             self._trainer = self.build_trainer(self._model, scene, budget, stage)
         self._trainer.seconds, self._trainer.cpu_seconds = lap.seconds()
+        self._trainer.began = self._trainer.spent
         if self._warm_start_state is not None:
             stored, own = self._warm_start_state.under(VIEWS), self._trainer.corrections.state_dict()
             if all(tensor.shape == stored[name].shape for name, tensor in own.items() if name in stored):

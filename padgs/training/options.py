@@ -47,14 +47,15 @@ class Budget:
             return f"{self.iterations} iterations"
         return f"{self.seconds:g} s{' of CPU time' if self.clock == 'cpu' else ''}"
 
-    def next_step(self, last: int, spent: float, step_seconds: float, skipped: int = 0) -> int:
+    def next_step(self, last: int, spent: float, step_seconds: float, *, skipped: int = 0, began: float = 0.0) -> int:
         """Return the schedule step of the next iteration; `iterations` for the last one.
 
         Args:
             last: step of the iteration before, 0 for none.
-            spent: seconds of training so far.
+            spent: seconds of training so far, with building the initial model.
             step_seconds: expected duration of the next iteration.
             skipped: steps that took no time because they were skipped.
+            began: seconds spent before the first step; the schedule fills the rest.
 
         >>> timed = Budget(100, seconds=10.0)
         >>> Budget(100).next_step(6, spent=50.0, step_seconds=1.0), timed.next_step(6, spent=4.0, step_seconds=1.0)
@@ -62,10 +63,11 @@ class Budget:
         """
         if self.seconds is None:
             return last + 1
-        spent += skipped / self.iterations * self.seconds
+        length = self.seconds - began
+        spent += skipped / self.iterations * length
         if spent + 1.5 * step_seconds >= self.seconds:  # one more would end more than half a step too late
             return self.iterations
-        return min(max(last, round(self.iterations * (spent + step_seconds) / self.seconds), 1), self.iterations - 1)
+        return min(max(last, round(self.iterations * (spent - began + step_seconds) / length), 1), self.iterations - 1)
 
 
 @dataclass(frozen=True)
