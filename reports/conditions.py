@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import pandas as pd
 from pandas import DataFrame
 
-from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS
+from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, by_conditions
 from padgs.reports.methods import name, title
 from padgs.reports.selection import Mixture, Request
 from padgs.reports.table import UNRANKED
+from padgs.results import file_name
 
 # Columns of the frame; "protocol" means its rules.
 OF_A_DATA_SET = ("protocol", "resolution", "length", "learning_rates")  # scenes may differ, rules may not
@@ -59,6 +60,16 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
             column = _column(what, request.protocol)
             difference = f"{where}: results differ in {what} ({examples})"
             raise Mixture(difference, "choose with --where, or compare them anyway with --mix", runs, [column])
+
+
+def sheets(
+    runs: DataFrame, request: Request, kind: str, shared: Iterable[str] = CONDITIONS
+) -> Iterator[tuple[str, str, DataFrame]]:
+    """Yield file name, title and runs of each scene, resolution and length; `shared`: see `refuse_mixture`."""
+    for where, own in by_conditions(runs, "resolution", "length").items():
+        refuse_mixture(own, request, where, shared)
+        first = own.iloc[0]
+        yield file_name(f"{kind}_{first['place'].stem}_{first['resolution']}_{first['length']}"), where, own
 
 
 def as_published(runs: DataFrame) -> bool:

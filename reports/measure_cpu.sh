@@ -30,7 +30,7 @@ E bedroom,court 18 220 +sweep=tau train.iterations=1500 data.width=256 seed=0,1,
 E bedroom,court 12 220 +sweep=lambda train.iterations=1500 data.width=256 seed=0,1,2 train.lambda_l1=0.2,0.6,0.8,1
 E bedroom,court 12 220 +sweep=voxel_size train.iterations=1500 data.width=256 seed=0,1,2 method.voxel_pixels=0.1,1,3,10
 F bedroom,room,basement 21 200 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 smallest=on method=omnigs,odgs,op43dgs,spags_sorted,spags_tuned,padgs,padgs_plus
-F bedroom,room,basement 105 100 +experiment=capacity train.iterations=1500 data.width=256 seed=0,1,2 budget.gaussians=10000,20000,40000,80000,160000 method=omnigs,odgs,op43dgs,spags_sorted,spags_tuned,padgs,padgs_plus
+F bedroom,room,basement 105 100 +experiment=capacity train.iterations=1500 data.width=256 seed=0,1,2
 G builtin 285 110 +experiment=stress train.iterations=1500 data.width=256 seed=0,1,2 stress.level=2 method=omnigs,op43dgs,spags_tuned,padgs,padgs_plus
 G builtin 40 270 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=$released stress.condition=none,world_rotation,seam,pitch,world_scale,few_points,pose_noise,few_views,exposure,noise
 J bedroom,flat,basement,court 36 50 +experiment=plus_ablation train.iterations=1000 data.width=256 seed=0,1

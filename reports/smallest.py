@@ -23,13 +23,12 @@ from padgs.reports.charts.drawing import (
     spans,
     styled,
 )
-from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
-from padgs.reports.frame import by_conditions
+from padgs.reports.conditions import OF_TIMES, footnotes, sheets
 from padgs.reports.selection import RunSet, settings
 from padgs.reports.significance import mean_cell
 from padgs.reports.store import split_image
 from padgs.reports.table import Block, Cell, Column, Row, Table
-from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, SMALLEST_STATED, file_name
+from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, SMALLEST_STATED
 
 STATED = f"{SMALLEST_STATED:g}"  # dB, as results name losses
 PANELS = (
@@ -146,8 +145,7 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
 def table(run_set: RunSet) -> Table:
     """Return a block for each scene, resolution and length, and a row for each method whose runs were searched."""
     blocks, shown = [], {}
-    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
-        refuse_mixture(own, run_set.request, title, OF_TIMES)
+    for _, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
         rows = (
             Row(method, tuple(_over_seeds(map(number, seeds)) for number in COLUMNS.values()))
             for method, seeds in by_method(curves(own)).items()
@@ -165,9 +163,7 @@ def _over_seeds(values: Iterable[float | None]) -> Cell:
 def charts(run_set: RunSet) -> list[Chart]:
     """Return a chart for each scene that was searched, and one of test views if there are renders."""
     found = []
-    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
-        refuse_mixture(own, run_set.request, title, OF_TIMES)
-        name = file_name(f"smallest_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
+    for name, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
         if rendered := [curve for curve in curves(own) if curve.image is not None]:

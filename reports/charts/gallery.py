@@ -11,11 +11,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from padgs.reports import methods
 from padgs.reports.charts.drawing import INK, PAPER, Chart, wrap_title
-from padgs.reports.conditions import footnotes, refuse_mixture
-from padgs.reports.frame import by_conditions
+from padgs.reports.conditions import footnotes, sheets
 from padgs.reports.selection import RunSet
 from padgs.reports.store import render_names, split_image
-from padgs.results import file_name
 
 COLUMNS = 3
 WIDTH, GAP, TITLE, FONT_SIZE, LETTER = 420, 12, 22, 14, 9  # pixels: of an image, between images, of lines and letters
@@ -26,12 +24,10 @@ def charts(run_set: RunSet) -> list[Chart]:
     """Return a sheet for each scene, resolution and length with renders of test views; one seed is enough."""
     runs, found = run_set.chosen("gallery"), []
     runs = runs.loc[runs["ok"] & (runs["variant"] == "") & (runs["renders"].map(render_names).map(len) > 0)]
-    for where, own in by_conditions(runs, "resolution", "length").items():
-        refuse_mixture(own, run_set.request, where, ("protocol", "data"))
+    for name, where, own in sheets(runs, run_set.request, "gallery", ("protocol", "data")):
         own = own.sort_values("seed", kind="stable").drop_duplicates("preset")
         shared = sorted(set.intersection(*(set(render_names(folder)) for folder in own["renders"])))
         if shared and (images := _images(own, view := shared[len(shared) // 2], run_set.warnings)):
-            name = file_name(f"gallery_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
             title = f"{where}\ntest view {Path(view).stem}, below each render its error, with the PSNR of this view"
             found.append(_sheet(name, title, images, tuple(footnotes({where: own}, run_set.request.protocol))))
     return found

@@ -11,14 +11,13 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports import methods, published
-from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, unranked
-from padgs.reports.frame import by_conditions, by_place
+from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets, unranked
+from padgs.reports.frame import by_place
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, settings
 from padgs.reports.significance import over_scenes
 from padgs.reports.table import Cell
-from padgs.results import file_name
 
 FEWEST = 3  # methods in a chart of equal time
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
@@ -113,12 +112,9 @@ def equal_times(run_set: RunSet) -> list[TradeOff]:
     """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods."""
     runs, found = run_set.of_experiments("equal_time"), []
     shown = replace(run_set.request, protocol=_protocol(runs))
-    for title, own in by_conditions(runs.loc[runs["variant"] == ""], "resolution", "length").items():
-        refuse_mixture(own, shown, title, OF_A_CHART)
-        place, first = own["place"].iloc[0], own.iloc[0]
-        made = _trade_off("equal_time", {place: own}, shown)
+    for name, title, own in sheets(runs.loc[runs["variant"] == ""], shown, "equal_time", OF_A_CHART):
+        made = _trade_off("equal_time", {own["place"].iloc[0]: own}, shown)
         if len({point.preset for point in made.points}) >= FEWEST:
-            name = file_name(f"equal_time_{place.stem}_{first['resolution']}_{first['length']}")
             found.append(replace(made, name=name, title=title))
     return found
 

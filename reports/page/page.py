@@ -73,7 +73,7 @@ def html(run_set: RunSet) -> str:
         rows_of=rows_of,
         spans=_spans,
         maps=_charts(made["stability"]),
-        charts=_charts([*made["chart"], *made["smallest_chart"]]),
+        charts=_charts([*made["chart"], *made["capacity_chart"], *made["smallest_chart"]]),
         sweeps=_charts(made["sweep"]),
         views=views,
         data=json.dumps({"images": views.images, "scenes": views.scenes}).replace("<", "\\u003c"),  # no end of script

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 from omegaconf import OmegaConf
-from support.made_up import RULES, builder, columns, compared, of_experiment, result, run_set, small, value
+from support.made_up import RULES, budgets, builder, columns, compared, of_experiment, result, run_set, small, value
 
 from padgs.baselines import BUILT_IN, METHODS
 from padgs.checks import lookup
@@ -22,6 +22,7 @@ table1, table4, methods, equal_time = map(builder, ("table1", "table4", "methods
 ladder, deviations, order, length = map(builder, ("ladder", "deviations", "order", "length"))
 learning_rates, modulation, capacity, runs = map(builder, ("learning_rates", "modulation", "capacity", "runs"))
 ROOM = "synthetic-room"
+BUDGETS = {("omnigs", 20_000): 24.0, ("omnigs", 50_000): 26.0, ("odgs", 20_000): 25.0, ("odgs", 50_000): 25.5}
 
 
 def ranks(table: Table, block: str = ROOM) -> dict[str, set[str]]:
@@ -62,18 +63,6 @@ def crossed(seeds=(0.0, 0.1)):
         for tau in (0, 1)
         for seed, off in enumerate(seeds)
     ]
-
-
-def budgets():
-    """Runs of `capacity`."""
-    psnr = {("omnigs", 20_000): 24.0, ("omnigs", 50_000): 26.0, ("odgs", 20_000): 25.0, ("odgs", 50_000): 25.5}
-    made = []
-    for (preset, count), quality in psnr.items():
-        for seed in (0, 1):
-            one = of_experiment("capacity", quality + 0.1 * seed, preset=preset, seed=seed)
-            config = {**one.config, "budget": {"gaussians": count}}
-            made.append(replace(one, run=f"{one.run}_{count}", config=config, counts={"gaussians": count - seed}))
-    return made
 
 
 def scaled(best):
@@ -138,7 +127,7 @@ def test_each_variant_that_can_be_run_has_a_row(root, table, titles):
     ("build", "made"),
     [
         (modulation, crossed()),
-        (capacity, budgets()),
+        (capacity, budgets(BUDGETS)),
         (learning_rates, scaled(lambda n: 2)),
         (equal_time, [timed("padgs", 100, 900, 25), timed("omnigs", 100, 900, 24)]),
     ],
@@ -362,7 +351,7 @@ def test_voxels_are_crossed_with_modulation_and_the_paper_may_score_without_the_
 def test_each_number_of_gaussians_has_a_block_the_fewest_first():
     odd = of_experiment("capacity", 30.0)
     odd = [replace(odd, run=f"{n}", config={**odd.config, "budget": {"gaussians": n}}) for n in ("auto", None)]
-    table = capacity(run_set([*budgets(), *odd]))
+    table = capacity(run_set([*budgets(BUDGETS), *odd]))
     for block, count, expected in zip(table.blocks, (20_000, 50_000), ((25.05, 24.05), (25.55, 26.05)), strict=True):
         assert block.title.endswith(f"at most {count // 1000} 000 Gaussians")
         cells = [[row.cells[columns(table).index(name)].value for row in block.rows] for name in ("PSNR", "Gaussians")]

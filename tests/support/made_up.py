@@ -139,6 +139,17 @@ def of_experiment(
     return replace(made, run="_".join(map(str, (name, made.scene, preset, iterations, train, options, seed))))
 
 
+def budgets(psnr: dict[tuple[str, int], float]) -> list[Result]:
+    """Two runs of `capacity` for each method and limit, with this PSNR and 0.1 dB more."""
+    made = []
+    for (preset, count), quality in psnr.items():
+        for seed in (0, 1):
+            one = of_experiment("capacity", quality + 0.1 * seed, preset=preset, seed=seed)
+            config = {**one.config, "budget": {"gaussians": count}}
+            made.append(replace(one, run=f"{one.run}_{count}", config=config, counts={"gaussians": count - seed}))
+    return made
+
+
 def compared(scenes=("synthetic-room", "synthetic-outdoor"), seeds: int = 2) -> list[Result]:
     """All methods of the paper on some scenes; OP43DGS runs out of memory outdoors, as there."""
     made = []
