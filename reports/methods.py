@@ -21,15 +21,9 @@ EXTERNAL = "external: "  # presets of models and renders that another program ma
 
 
 @cache
-def outside(group: str, name: str, attribute: str) -> str:
-    """Return a text attribute of what another package offers by an entry point; empty where it says none.
-
-    Args:
-        group: padgs.methods (classes) or padgs.datasets.
-        name: of the method or data set.
-        attribute: title or color (#rrggbb).
-    """
-    for point in entry_points(group=group, name=name):
+def outside(method: str, attribute: str) -> str:
+    """Return the title or color (#rrggbb) of a method of another package, an attribute of its class; else empty."""
+    for point in entry_points(group="padgs.methods", name=method):
         try:
             value = getattr(point.load(), attribute, "")
         except Exception:  # of a package that does not work; a run that needs it says so
@@ -46,7 +40,7 @@ def _others() -> tuple[str, ...]:
 
 def color(method: str) -> str:
     """Return the colour of a method as #rrggbb; empty if it has none."""
-    return METHODS[method]["color"] if method in METHODS else outside("padgs.methods", method, "color")
+    return METHODS[method]["color"] if method in METHODS else outside(method, "color")
 
 
 def method_of(preset: str) -> str:
@@ -63,7 +57,7 @@ def name(method: str) -> str:
     """Return the authors' name of a method, or else its name in the configuration; labels of other programs' models."""
     if method.startswith(EXTERNAL):
         return f"{method.removeprefix(EXTERNAL)} (external)"
-    return METHODS[method]["title"] if method in METHODS else outside("padgs.methods", method, "title") or method
+    return METHODS[method]["title"] if method in METHODS else outside(method, "title") or method
 
 
 def title(preset: str) -> str:

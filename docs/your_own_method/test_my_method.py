@@ -60,4 +60,4 @@ def test_it_draws_nothing_before_it_has_learned(scene):
     with pytest.raises(RuntimeError, match="call fit or load_state first"):
         made().render(scene.test[0])
     with pytest.raises(ValueError, match="must be > 0"):
-        padgs.make_method(NAME, "method.thinner=0")  # your own rules, if you have any
+        padgs.make_method(NAME, "method.rate=0")  # your own rules, if you have any

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from padgs.checks import lookup
@@ -34,6 +35,8 @@ LOADERS = {
     "released": "padgs.data.formats.reconstructions:read_released",
     "synthetic": "padgs.data.synthetic:load",
 }
+OUTSIDE = {point.name: point for point in entry_points(group="padgs.datasets") if point.name not in LOADERS}
+LOADERS |= {name: point.value for name, point in OUTSIDE.items()}  # readers of other packages
 
 __all__ = ["DATASETS", "LOADERS", "DataError", "DataOptions", "load", "read"]
 
@@ -76,8 +79,13 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
     if format == "auto":
         format, reason = detect(path)
         notes = (reason,)
+    elif format in OUTSIDE:
+        package = OUTSIDE[format].dist
+        notes = (f"format: {format}, read by {package.name} {package.version}",) if package else ()
     if format == "synthetic":
         raise DataError(f"{path}: synthetic scenes are made, not read from a folder; give another format, or auto")
-    capture: Capture = lookup(LOADERS, format, "data.format")(path, options)
+    capture = lookup(LOADERS, format, "data.format")(path, options)
+    if not isinstance(capture, Capture):
+        raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
     return best_reading(found_images(replace(capture, mask=mask, notes=(*notes, *capture.notes))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -34,6 +35,28 @@ def optional_module(name: str, path: Path) -> Any:
         ) from error
 
 
+def _check_header(path: Path) -> None:
+    """Refuse counts beyond the length of a LAS or LAZ file, which laspy would read, or keep memory for, first."""
+    length = path.stat().st_size
+    with path.open("rb") as file:
+
+        def numbers(form: str, at: int) -> tuple[int, ...]:
+            file.seek(at)
+            return struct.unpack(form, file.read(struct.calcsize(form)))
+
+        size, start, count = numbers("<HII", 94)
+        extended, more = numbers("<QI", 235) if size >= 375 else (0, 0)
+        fits = size + 54 * count <= start <= length and (not more or extended + 60 * more <= length)
+        if (
+            fits and numbers("<B", 104)[0] & 0x80
+        ):  # LAZ: the table of chunks is where the first number of the points says
+            table = numbers("<q", start)[0]
+            table = numbers("<q", length - 8)[0] if table == -1 else table
+            fits = start <= table <= length - 8 and numbers("<I", table + 4)[0] <= length
+    if not fits:
+        raise ValueError("its header does not fit its length")
+
+
 @contextmanager
 def _readable(path: Path, again: str) -> Iterator[None]:
     refuse_special(path)
@@ -41,9 +64,10 @@ def _readable(path: Path, again: str) -> Iterator[None]:
         raise DataError(f"the point cloud {path} does not exist")
     try:
         yield
-    except DataError:
-        raise
-    except Exception as error:  # both packages raise what their libraries raise
+    except BaseException as error:  # both packages raise what their libraries raise, and decoders in Rust panic
+        is_panic = type(error).__name__ == "PanicException"
+        if isinstance(error, DataError) or not (isinstance(error, Exception) or is_panic):
+            raise
         why = str(error).partition("\n")[0] or type(error).__name__
         raise DataError(f"{path} is cut short, damaged or of another kind ({why}); {again}") from error
 
@@ -57,7 +81,18 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
     laspy = optional_module("laspy", path)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         optional_module("lazrs", path)
-    with _readable(path, "export it again as LAS 1.2 to 1.4"), laspy.open(path) as file:
+    # Of the decoders of LAZ, the parallel one ends the process if a damaged file states a chunk larger than memory.
+    decoders = [decoder for decoder in laspy.LazBackend.detect_available() if decoder.name != "LazrsParallel"]
+    with _readable(path, "export it again as LAS 1.2 to 1.4"):
+        _check_header(path)
+        points, colors, step = _las_points(laspy.open(path, laz_backend=decoders), path)
+    paint = None if colors is None else color_bytes(colors, str(path))
+    return _thinned(path, points, paint, step)
+
+
+def _las_points(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Return every `step`-th point [P, 3], its colours [P, 3] if there are any, and `step`."""
+    with reader as file:
         step = -(-file.header.point_count // MOST_POINTS) or 1
         coloured = set(CHANNELS) <= set(file.header.point_format.dimension_names)
         points, colors, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint16)], 0
@@ -69,8 +104,7 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
             start += len(chunk)
         if start != file.header.point_count:
             raise DataError(f"{path} states {file.header.point_count} points but holds {start}; copy it again")
-    paint = color_bytes(np.concatenate(colors), str(path)) if coloured else None
-    return _thinned(path, np.concatenate(points), paint, step)
+    return np.concatenate(points), np.concatenate(colors) if coloured else None, step
 
 
 def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:

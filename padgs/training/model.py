@@ -59,6 +59,13 @@ class TrainingRender:
     _: KW_ONLY
     penalty: Tensor | None = None  # scalar, added to the loss
 
+    @classmethod
+    def of_pixels(cls, rendering: Rendering, penalty: Tensor | None = None) -> TrainingRender:
+        """Return the render of a model without Gaussians; in their place is one of opacity 0."""
+        row = torch.zeros(1, 3)
+        none = Gaussians(row, torch.ones(1, 4), row + 1, torch.zeros(1), row)
+        return cls(rendering, torch.zeros(1, 2), none, torch.zeros(1, dtype=torch.int64), penalty=penalty)
+
 
 @dataclass(frozen=True)
 class Record:

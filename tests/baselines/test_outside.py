@@ -2,16 +2,20 @@
 
 import importlib
 import inspect
+import os
+import subprocess
 import sys
 from configparser import ConfigParser
 
 import pytest
+from support.fixtures import make_world, write_images
 from support.tiny_scene import tiny_scene
 
 import padgs
 from padgs import baselines
 from padgs.baselines import METHODS, clash, distribution, outside
 from padgs.multirun.composition import register_choices
+from padgs.reports import methods
 from padgs.runs.config import config_from_values
 from padgs.runs.run import initial_result
 
@@ -22,22 +26,23 @@ def installed(root, tmp_path, monkeypatch):
     folder = root / "docs" / "your_own_method"
     stated = ConfigParser()
     stated.read(folder / "pyproject.toml")
-    (point,) = stated['project.entry-points."padgs.methods"'].items()
+    groups = ("padgs.methods", "padgs.datasets")
+    points = {group: stated[f'project.entry-points."{group}"'].items() for group in groups}
+    lines = [f"[{group}]\n{name} = {value}" for group, ((name, value),) in points.items()]
     information = tmp_path / "my_method-0.1.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: my-method\nVersion: 0.1\n")
-    (information / "entry_points.txt").write_text("[padgs.methods]\n{} = {}".format(*point).replace('"', ""))
+    (information / "entry_points.txt").write_text("\n".join(lines).replace('"', ""))
     for path in (folder, tmp_path):
         monkeypatch.syspath_prepend(path)
     for name, value in outside().items():
         monkeypatch.setitem(METHODS, name, value)
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "cache"))
     yield importlib.import_module("test_my_method")
-    for module in ("my_method", "test_my_method"):
+    for module in ("my_method", "my_reader", "test_my_method"):
         sys.modules.pop(module, None)
 
 
-@pytest.mark.slow
 def test_tests_of_the_example_method_pass(installed, tmp_path):
     assert "my_method" in METHODS
     scene = padgs.load_scene(generator=installed.ROOM)
@@ -46,6 +51,20 @@ def test_tests_of_the_example_method_pass(installed, tmp_path):
         wanted = {"scene": scene, "tmp_path": tmp_path / "checkpoint"}
         promise(**{name: wanted[name] for name in inspect.signature(promise).parameters})
     assert len(promises) == 4
+
+
+def test_a_format_of_another_package_is_read_by_its_name(installed, root, tmp_path):
+    folder, world = tmp_path / "capture", make_world()
+    write_images(world, folder / "images")
+    with (folder / "poses.csv").open("w") as file:
+        file.write("name,qw,qx,qy,qz,x,y,z\n")
+        for index, name in enumerate(world.names):
+            file.write(f"{name}.png,1,0,0,0,{index},0,0\n")
+    code = "import padgs, sys; print(*padgs.load_scene(sys.argv[1], format='my_format').notes, sep='\\n')"
+    places = os.pathsep.join((str(root / "docs/your_own_method"), str(tmp_path)))
+    command, environment = [sys.executable, "-c", code, folder], {**os.environ, "PYTHONPATH": places}
+    done = subprocess.run(command, env=environment, text=True, capture_output=True)
+    assert done.returncode == 0 and "format: my_format, read by my-method 0.1" in done.stdout, done.stderr
 
 
 def test_names_of_built_in_methods_are_refused(installed, monkeypatch):
@@ -97,3 +116,4 @@ def test_results_say_which_package_they_are_of(installed):
     config = config_from_values({"method": {"name": "my_method"}, "protocol": {"paper": {}}})
     assert initial_result(config, tiny_scene(), "run").code_version.endswith(" my-method 0.1")
     assert distribution("padgs") == ""
+    assert (methods.title("my_method"), methods.color("my_method")) == ("My method", "#8a5a2b")

@@ -1,6 +1,8 @@
 """Captures and clouds of scanners: NavVis, E57 and LAS."""
 
+import contextlib
 import importlib
+import struct
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -88,6 +90,21 @@ def test_las_clouds(end: str, scale: int, coloured: bool, laspy, world: World, t
     (tmp_path / f"cloud.{end}").write_bytes(whole[:-900])
     with pytest.raises(DataError, match=rf"cloud.{end} (is cut short, damaged|states 400 points but holds)"):
         read_cloud(tmp_path / f"cloud.{end}")
+
+
+@pytest.mark.parametrize(
+    ("offset", "value"),
+    [(100, 2**32 - 1), (96, 2**32 - 1), (294, 2**32 - 1), (310, 0), (324, 2**31 - 1), (-10, 2**31)],
+)
+def test_numbers_of_a_damaged_laz_file_neither_end_nor_delay_the_process(offset, value, laspy, world, tmp_path):
+    data = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
+    data.x, data.y, data.z = world.points.T
+    data.write(str(tmp_path / "cloud.laz"))
+    whole = bytearray((tmp_path / "cloud.laz").read_bytes())
+    struct.pack_into("<I", whole, offset, value)  # negative: from the end
+    (tmp_path / "cloud.laz").write_bytes(whole)
+    with contextlib.suppress(DataError):  # or points that are as many as stated
+        assert len(read_cloud(tmp_path / "cloud.laz")[0].points) == len(world.points)
 
 
 @pytest.fixture
