@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
@@ -19,7 +18,7 @@ from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
 from padgs.reports.published import DATASETS, NEVER_SEEN, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
-from padgs.reports.significance import CONFIDENCE
+from padgs.reports.significance import CONFIDENCE, paired_test
 from padgs.reports.table import MISSING
 from padgs.reports.writers import Page, rendered
 from padgs.results import higher_is_better
@@ -117,8 +116,7 @@ class Evidence:
         """Interval of the mean advantage over the tested scenes; None for fewer than two."""
         if len(self.tested) < 2:
             return None
-        found = _test(self.tested["advantage"]).confidence_interval(CONFIDENCE)
-        return float(found.low), float(found.high)
+        return paired_test([*self.tested["advantage"]])[1:]
 
 
 def load() -> list[Claim]:
@@ -133,21 +131,13 @@ def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
     A claim holds (is not reproduced) if the mean is significantly positive (negative), and every scene is likewise.
     """
     found = [Evidence(claim, measured(claim, run_set)) for claim in claims]
-    found = [replace(one, p=float(_test(one.tested["advantage"]).pvalue)) if one.interval else one for one in found]
+    found = [replace(one, p=paired_test([*one.tested["advantage"]])[0]) if one.interval else one for one in found]
     tested = sorted((one.p, index) for index, one in enumerate(found) if not math.isnan(one.p))
     adjusted = 0.0
     for rank, (p, index) in enumerate(tested):
         adjusted = max(adjusted, min(1.0, (len(tested) - rank) * p))
         found[index] = replace(found[index], p=adjusted)
     return [replace(one, verdict=_verdict(one)) for one in found]
-
-
-def _test(advantages: Any) -> Any:
-    from scipy.stats import ttest_rel
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # equal advantages have no spread
-        return ttest_rel(advantages, [0.0] * len(advantages))
 
 
 def _verdict(evidence: Evidence) -> str:

@@ -43,7 +43,8 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     numbers["polar_transmittance"] = [value[0] if value else math.nan for value in last]
     numbers["train_hours"], numbers["fps"] = numbers["train_seconds"] / 3600, 1000 / numbers["frame_ms"]
     config = _columns(parts[4], object).add_prefix(CONFIG)
-    return pd.concat([facts.astype({"ok": bool}), rules, metrics, numbers, config], axis=1)
+    made = pd.concat([facts.astype({"ok": bool}), rules, metrics, numbers, config], axis=1)
+    return made.copy()  # a block of memory for each type, which makes every selection of rows faster
 
 
 def row_of(run: Run) -> tuple[dict[str, Any], ...]:

@@ -82,11 +82,14 @@ class Chart:
     @cached_property
     def png(self) -> bytes:
         """The figure on white paper."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
         data = io.BytesIO()
         if isinstance(self.figure, Image.Image):
             self.figure.save(data, "PNG")
             return data.getvalue()
-        self.figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
+        self.figure.set_dpi(DPI)
+        FigureCanvasAgg(self.figure).print_png(data, metadata={"Software": None})  # `savefig` would draw it twice
         return data.getvalue()
 
     @cached_property

@@ -2,11 +2,12 @@ import math
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.special import stdtrit
+from scipy.stats import ttest_ind_from_stats, ttest_rel
 
-from padgs.reports.significance import BEST, SECOND, differ, emphasis, places
+from padgs.reports.significance import BEST, SECOND, differ, emphasis, paired_test, places
 from padgs.reports.table import Block, Cell, Column, Row
 
 PSNR, LPIPS, COUNT = Column("PSNR", 2, True), Column("LPIPS", 3, False), Column("Gaussians", 0)
@@ -46,6 +47,21 @@ ONE, TWO, THREE = seeds(10.0), seeds(20.0), seeds(30.0)
 )
 def test_best_and_second(column, cells, expected):
     assert ranks(column, *cells) == expected
+
+
+@given(st.lists(st.floats(-9, 9), min_size=2, max_size=6), *(st.floats(0.01, 3) for _ in range(2)), st.integers(3, 9))
+def test_tests_agree_with_scipy(differences, one, other, count):
+    cells = Cell(25.0, one, count), Cell(26.0, other, 4)
+    expected = ttest_ind_from_stats(*(25.0, one, count), *(26.0, other, 4), equal_var=False).pvalue < 0.05
+    assert differ(*cells, PSNR) == expected
+    assume(max(differences) - min(differences) > 1e-6)
+    found = ttest_rel(differences, [0.0] * len(differences))
+    p, *interval = paired_test(differences)
+    assert p == pytest.approx(found.pvalue, rel=1e-6) and interval == pytest.approx([*found.confidence_interval(0.95)])
+
+
+def test_equal_differences_are_certain_unless_they_are_zero():
+    assert paired_test([1.0, 1.0]) == (0.0, 1.0, 1.0) and paired_test([0.0, 0.0])[0] == 1.0
 
 
 def test_means_are_tested_as_they_are_and_not_as_they_print():
