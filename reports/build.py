@@ -274,12 +274,11 @@ class _Builder:
         return tuple(Row(title, (ranks.get(i, Cell()), *row)) for i, (title, row) in enumerate(found))
 
     def _each_run(self, runs: DataFrame) -> Iterator[Row]:
-        ok = numbers_of(runs, self.measures)
-        numbers = dict(zip(ok.index, ok.to_numpy().tolist(), strict=True))
         for one in settings(runs):
-            for index, seed, run, status in one.runs[["seed", "run", "status"]].itertuples():
+            own = zip(*(one.runs[of] for of in ("seed", "run", "ok", "status")), strict=True)
+            for (seed, run, ok, status), values in zip(own, numbers_of(one.runs, self.measures).tolist(), strict=True):
                 title = ", ".join([one.preset, *one.apart, f"seed {seed}", run.rpartition("_")[2]])
-                failed, values = ("", numbers[index]) if index in numbers else (status, [math.nan] * len(self.measures))
+                failed = "" if ok else status
                 yield Row(title, tuple(mean_cell([] if math.isnan(value) else [value], failed) for value in values))
 
 

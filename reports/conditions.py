@@ -74,9 +74,12 @@ def sheets(
 
 def as_published(runs: DataFrame) -> bool:
     """Return whether runs have the size and the length of the paper, without which numbers cannot be compared."""
-    lengths = (f"{PUBLISHED_LENGTHS.get(method, PUBLISHED_ITERATIONS)} iterations" for method in runs["method"])
-    widths = runs["resolution"].map(lambda size: int(size.partition("x")[0]))
-    return bool(len(runs) and (widths >= PUBLISHED_WIDTH).all() and (runs["length"] == [*lengths]).all())
+    kinds = {*zip(runs["method"], runs["resolution"], runs["length"], strict=True)}
+    return bool(kinds) and all(
+        int(size.partition("x")[0]) >= PUBLISHED_WIDTH
+        and length == f"{PUBLISHED_LENGTHS.get(method, PUBLISHED_ITERATIONS)} iterations"
+        for method, size, length in kinds
+    )
 
 
 def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
@@ -132,7 +135,8 @@ def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]
     for preset, images in seen[seen < LEAST_SHARE * seen.max()].items() if equal_images else ():
         found[str(preset)] = Reason(FEWER_IMAGES, f"{images:.0f} of {seen.max():.0f} images")
     for method, keys in CALIBRATES.items():
-        own = runs.loc[runs["method"] == method]
+        if (own := runs.loc[runs["method"] == method]).empty:
+            continue
         errors = own.reindex(columns=[f"{CONFIG}data.generator.{key}" for key in keys]).fillna(0).astype(bool)
         corrected = errors.any(axis=1) & (own["dataset"] == "synthetic")  # other data ignore the generator's keys
         found |= dict.fromkeys(own.loc[~corrected, "preset"], Reason(NOTHING_TO_CORRECT))

@@ -152,8 +152,9 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
     Raises:
         ReportError: no run has the experiment or a key of the request; the message lists the known ones.
     """
-    every, known = runs, sorted(set(runs["experiments"].explode().dropna()))
+    every = runs
     if request.experiment:
+        known = sorted(set(runs["experiments"].explode().dropna()))
         if not any(map(request.matches, known)):
             raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
         runs = runs.loc[[any(map(request.matches, of)) for of in runs["experiments"]]]
@@ -230,17 +231,14 @@ def one_setting(runs: DataFrame, where: str, apart_in: str = "place") -> DataFra
     """
     ordered = runs.sort_values("seed", kind="stable")
     refuse_differences(ordered, where, apart_in)
-    for _, same in grouped(ordered, "seed"):
-        if len(same) > 1:
-            first, second, *_ = same["run"]
-            raise ReportError(f"{where}: runs {first} and {second} are the same setting; delete one of them")
+    if (same := ordered.loc[ordered["seed"].duplicated(keep=False), "run"]).size:
+        first, second, *_ = same
+        raise ReportError(f"{where}: runs {first} and {second} are the same setting; delete one of them")
     return ordered
 
 
 def refuse_differences(runs: DataFrame, where: str, apart_in: str = "place") -> None:
     """Raise Mixture if runs differ in more than the seed and keys without effect; `apart_in`: see `Mixture`."""
-    if runs["setting"].nunique() < 2:
-        return
     every = differing_keys(runs)
     for other in range(1, len(runs)) if every else ():
         two = runs.iloc[[0, other]]
@@ -252,6 +250,8 @@ def refuse_differences(runs: DataFrame, where: str, apart_in: str = "place") -> 
 
 def differing_keys(runs: DataFrame) -> list[str]:
     """Return the dotted keys in which configurations differ, without seeds and keys without effect."""
+    if runs["setting"].nunique() < 2:
+        return []
     keys = [name.removeprefix(CONFIG) for name in runs if name.startswith(CONFIG)]
     keys = [key for key in keys if decides(key)]
     values = runs[[CONFIG + key for key in keys]].to_numpy()

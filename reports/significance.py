@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pandas import DataFrame
 
 from padgs.reports.measures import Measure
@@ -28,7 +29,7 @@ def unrank(cells: Sequence[Cell]) -> list[Cell]:
 def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:
     """Return a cell for each measure: mean and deviation over successful runs, and the status of failed ones."""
     failed = " ".join(runs.loc[~runs["ok"], "status"].unique())
-    numbers = numbers_of(runs, measures).to_numpy()
+    numbers = numbers_of(runs, measures)
     return [mean_cell(column[~np.isnan(column)].tolist(), failed) for column in numbers.T]
 
 
@@ -37,18 +38,23 @@ def over_scenes(runs: DataFrame, scenes: Sequence[Place], measures: Sequence[Mea
 
     Missing if any scene has no number, because means over different scenes cannot be compared.
     """
-    places = runs["place"].map(lambda place: place.title).rename("place")
-    by_seed, titles = numbers_of(runs, measures).groupby([runs["seed"], places]).last(), [one.title for one in scenes]
-    found = []
-    for measure in measures:
-        complete = by_seed[measure.name].unstack("place").reindex(columns=titles).dropna()
-        found.append(mean_cell([math.fsum(values) / len(scenes) for values in complete.to_numpy()]))
+    by_seed: dict[int, dict[Place, NDArray]] = {}
+    for seed, place, numbers in zip(runs["seed"], runs["place"], numbers_of(runs, measures), strict=True):
+        by_seed.setdefault(seed, {})[place] = numbers
+    complete = [[of[place] for place in scenes] for _, of in sorted(by_seed.items()) if of.keys() >= {*scenes}]
+    sums = [[math.fsum(numbers) for numbers in zip(*of, strict=True)] for of in complete]
+    means = ([total / len(scenes) for total in totals if not math.isnan(total)] for totals in zip(*sums, strict=True))
+    return list(map(mean_cell, means)) if complete else [Cell() for _ in measures]
+
+
+def numbers_of(runs: DataFrame, measures: Sequence[Measure]) -> NDArray:
+    """Return the numbers [run, measure]; NaN where a run failed or has none."""
+    found = np.full((len(runs), len(measures)), np.nan)
+    for index, measure in enumerate(measures):
+        if measure.name in runs:
+            found[:, index] = runs[measure.name]
+    found[~runs["ok"].to_numpy()] = np.nan
     return found
-
-
-def numbers_of(runs: DataFrame, measures: Sequence[Measure]) -> DataFrame:
-    """Return the numbers of successful runs, a column a measure."""
-    return runs.loc[runs["ok"]].reindex(columns=[measure.name for measure in measures]).astype(float)
 
 
 def mean_cell(values: Sequence[float], failed: str = "") -> Cell:
