@@ -17,7 +17,6 @@ from padgs.training.health import EarlyStopping, Failure, Monitor, out_of_memory
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget, TrainOptions
-from padgs.training.outliers import Outliers
 from padgs.training.schedule import Pace
 from padgs.training.targets import TrainingViews
 
@@ -90,8 +89,6 @@ class Trainer:
         held_out, device = self._early_stopping.held_out, self._optimizer.device
         self._unit, depth = scene.scale, options.depth_kind if options.depth_weight > 0 else None
         self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=depth)
-        ratio = options.outlier_ratio
-        self._outliers = None if ratio is None else Outliers(scene.train, self._views.targets, ratio)
         self._order: Any = self._views  # its state decides which data the next iterations see
         pixels = sum(view.width * view.height for view in scene.train)
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
@@ -159,8 +156,6 @@ class Trainer:
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
-                if self._outliers is not None:
-                    target = self._outliers.weighted(index, view, rendered.rendering, target, step / self.schedule)
                 loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))

@@ -95,9 +95,6 @@ class TrainOptions:
     # measured: in world units, also for initial points. monocular: inverse ranges up to a scale and a shift of each
     # view, which are fitted to each render.
     depth_kind: str = "measured"
-    # Pixels with an error above so many times that of nearby views at the same place weigh less, such as passers-by;
-    # null: all pixels count. See `padgs.training.outliers`.
-    outlier_ratio: float | None = None
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
     hold_out: int | None = None  # train without a fold of the views: `padgs.training.health.validation_folds`
 
@@ -112,6 +109,4 @@ class TrainOptions:
         else:
             check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "learning_rates")
         check(self, "at least 1", lambda every: every >= 1, "check_every")
-        rule = "at least 1, or none for no outliers"
-        check(self, rule, lambda ratio: ratio is None or 1 <= ratio < math.inf, "outlier_ratio")
         check(self, "the number of a fold, from 0, or none", lambda fold: fold is None or fold >= 0, "hold_out")

@@ -74,7 +74,8 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     cameras = dict(read_cameras(files["cameras"]))
     images = sorted(read_images(files["images"]), key=lambda image: image.id)
     points = read_points(files["points3D"]) if "points3D" in files else Points({}, colored, frozenset())
-    frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
+    _refuse_other_cameras(images, cameras, model)
+    frames = tuple(_frame(image, cameras[image.camera], folder, model) for image in images)
     notes = [*_file_notes(path, model, files, colored is not None), *_reference_notes(images, points)]
     return Capture(
         format="colmap",
@@ -151,14 +152,25 @@ def _reference_notes(images: list[Image], points: Points) -> list[str]:
     return notes
 
 
-def _frame(image: Image, camera: Camera | None, folder: Path, model: Path) -> Frame:
+def _refuse_other_cameras(images: list[Image], cameras: dict[int, Camera], model: Path) -> None:
+    models = {image.name: camera.model if (camera := cameras.get(image.camera)) else "missing" for image in images}
+    others = {name: found for name, found in models.items() if found not in PANORAMIC}
+    if not others:
+        return
+    way_out = (
+        f"delete the others from it (`colmap image_deleter`), so that {len(images) - len(others)} panoramas remain"
+        if len(others) < len(images)
+        else "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
+    )
+    raise DataError(
+        f"{len(others)} of {len(images)} images of {model} are of other cameras: "
+        f"{listed(f'{name} ({found})' for name, found in others.items())}; only panoramas (EQUIRECTANGULAR) can be "
+        f"used: {way_out}"
+    )
+
+
+def _frame(image: Image, camera: Camera, folder: Path, model: Path) -> Frame:
     name = check_name(image.name, str(find_file(model, "images")))
-    if camera is None or camera.model not in PANORAMIC:
-        raise DataError(
-            f"{name} has a {camera.model if camera else 'missing'} camera ({model}); only panoramas "
-            "(EQUIRECTANGULAR) can be used: reconstruct from the panoramas themselves (`padgs prepare`), or give the "
-            "sparse_equirectangular model"
-        )
     return Frame(name, folder / name, pose_of(image, f"{name} in {model}"), camera.width, camera.height)
 
 
