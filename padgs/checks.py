@@ -10,6 +10,7 @@ import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
 from importlib import import_module
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -111,7 +112,7 @@ def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
     >>> typed(Range, {"first": 0})
     Range(first=0.0, last=1.0)
     """
-    hints = get_type_hints(kind)
+    hints = _type_hints(kind)
     known = [field.name for field in fields(kind) if field.init]  # type: ignore[arg-type]
     for key in values:
         if key not in known:
@@ -126,6 +127,9 @@ def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
         raise
     except ValueError as error:
         raise ConfigError(f"{where}: {error}" if where else str(error)) from error
+
+
+_type_hints = cache(get_type_hints)  # which compiles every annotation
 
 
 def _refuse_beyond_limits(kinds: tuple[Any, ...], value: Any, where: str) -> None:
