@@ -163,8 +163,7 @@ def _owners(train: Sequence[View], seen: np.ndarray, points: Tensor, clusters: S
 def split(source: Path, destination: Path, count: int, format: str, options: DataOptions) -> list[str]:
     """Write a data set for each block into a new folder; images are links. Return a line about each block.
 
-    Raises:
-        DataError: the source cannot be used or divided, or the destination is not empty; nothing is written then.
+    Nothing is written if a DataError says that the source cannot be divided, or that the destination exists.
     """
     from scipy.spatial import KDTree
 
@@ -234,11 +233,7 @@ def partial_mask(view: View, held: np.ndarray) -> Callable[[], Tensor]:
 
 
 def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> Path:
-    """Join the runs of all blocks into a run on the whole data set, and score that on all test views.
-
-    Raises:
-        ValueError: a run is of no block, missing, twice, not finished, or of another method or other settings.
-    """
+    """Join the runs of all blocks into a run on the whole data set, and score that on all test views."""
     loaded = [load_run(folder, device=device) for folder in folders]
     pairs = sorted(((_block_of(run), run) for run in loaded), key=lambda pair: pair[0]["number"])
     (block, first), runs, numbers = pairs[0], [run for _, run in pairs], [other["number"] for other, _ in pairs]

@@ -50,7 +50,7 @@ def views_along(
     width: int = 0,
     perspective_shape: tuple[int | None, float] | None = None,
 ) -> list[View]:
-    """Return the views of a camera path through the scene of a run.
+    """Return the views of a camera path through the scene of a run; a ValueError if a file is no camera path.
 
     Args:
         run: with its scene.
@@ -60,10 +60,6 @@ def views_along(
         width: pixels; 0: width of the training views, half of it in perspective.
         perspective_shape: height in pixels (None: 9/16 of the width), and horizontal field of view in degrees; None
             renders panoramas.
-
-    Raises:
-        ValueError: the file is no camera path.
-        OSError: the file cannot be read.
     """
     scene, trained = run.scene, run.scene.train[0]
     if perspective_shape is None:
@@ -102,12 +98,11 @@ def write_video(
     spherical: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Path]:
-    """Render views and write them in order.
+    """Render views and write them in order; return the written videos or folders.
 
     Args:
         to: *.mp4, or a folder for PNGs. Files appear, and an existing video is replaced, when all frames are written.
-        views: one per frame.
-        render: renders a view.
+        views: one per frame, as `render` takes them.
         fps: frames per second of an .mp4.
         scene_scale: unit of depths.
         depth: also write depth: as colours in an .mp4 (bright is near); beside PNGs as distances along the rays, with
@@ -116,13 +111,6 @@ def write_video(
         origin: that of the scene's coordinates in the world of the data set.
         spherical: mark an .mp4 as a panorama.
         progress: called with the number of written frames.
-
-    Returns:
-        Written videos or folders.
-
-    Raises:
-        ValueError: another file format, the extra `video` is not installed, or sides that H.264 does not support.
-        OSError: the output cannot be written.
     """
     is_mp4 = to.suffix.lower() == ".mp4"
     if to.suffix and not is_mp4 and not to.is_dir():
@@ -237,11 +225,7 @@ XML = (
 
 
 def mark_spherical(video: Path) -> None:
-    """Mark an .mp4 with one track as an equirectangular panorama, in place.
-
-    Raises:
-        ValueError: the last box is not the index, or the index has no track.
-    """
+    """Mark an .mp4 with one track, whose index is the last box, as an equirectangular panorama, in place."""
     with video.open("r+b") as file:
         *_, (kind, start, size) = _boxes(file, 0, file.seek(0, 2))
         if kind != b"moov":

@@ -93,11 +93,7 @@ def is_splat_file(path: str) -> bool:
 
 
 def config_of(data: str, render: RenderConfig | None = None, device: str = "auto", **settings: Any) -> RunConfig:
-    """Return the configuration of a data set: a folder with keys of the `data` group, or a run, whose data it is.
-
-    Raises:
-        ValueError: keys beside a run, which has its own.
-    """
+    """Return the configuration of a data set: a folder with keys of the `data` group, or a run, whose data it is."""
     given = {name: value for name, value in settings.items() if value}
     if not (Path(data) / CONFIG_NAME).is_file():
         protocols = {name: PROTOCOLS[name] for name in ("paper", "sphere")}
@@ -132,9 +128,6 @@ class ExternalRun(LoadedRun):
             rays: a name of `RAYS`.
             transform: scene_from_file for `read_transform`, in the world of the data set; empty: the identity.
             device: auto, cpu or cuda.
-
-        Raises:
-            DataError, ValueError, OSError: the file, the data or the transform cannot be used.
         """
         render, notes = lookup_rays(rays), list[str]()
         config = None if config is None else replace(config, render=render)
@@ -197,11 +190,8 @@ def open_model(
     Args:
         path: of either.
         data: of a run: where its data have moved; of a file: a data set, or a run on it.
-        rays, transform: of a file, see `ExternalRun.open`.
+        rays, transform: of a file, see `ExternalRun.open`; a ValueError beside a run.
         device: auto, cpu or cuda.
-
-    Raises:
-        ValueError: options of files beside a run; and those of `load_run` and `ExternalRun.open`.
     """
     if not is_splat_file(path):
         if transform or rays != "exact":
@@ -258,8 +248,7 @@ class Renders:
     def find(cls, folder: Path, scene: Scene) -> Renders:
         """Find NAME.png for each test view NAME; folders in names are folders, or written as dashes.
 
-        Raises:
-            DataError: a render is missing, of another size, or no 8-bit image without transparency.
+        A DataError names what is missing, of another size, or no 8-bit image without transparency.
         """
         files, missing = dict[str, Path](), []
         for view in scene.test:
@@ -302,7 +291,7 @@ class Renders:
 def score_external(
     render: Render, config: RunConfig, scene: Scene, label: str, program: tuple[str, str], runs: Path
 ) -> tuple[Result, Path]:
-    """Score the test views, and write the result as that of a run.
+    """Score the test views, and write the result as that of a run; return it and its folder.
 
     Args:
         render: renders a test view.
@@ -311,13 +300,6 @@ def score_external(
         label: name in tables.
         program: name and version, empty if unknown.
         runs: parent of the run folder.
-
-    Returns:
-        The result, and its folder.
-
-    Raises:
-        ValueError: there are no test views.
-        RunFolderError: the folder cannot be written.
     """
     name = re.sub(r"[^A-Za-z0-9]+", "-", label).strip("-")[:40].lower()
     if not name:

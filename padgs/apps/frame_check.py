@@ -34,9 +34,6 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
         text: identity, 12 or 16 numbers (rows of a matrix), or a file of them (.json, .npy, text); nerfstudio's
             `dataparser_transforms.json` is inverted, because it maps the world of the data set to that of the model.
         transforms_json: of the data set, whose `applied_transform` nerfstudio's file includes.
-
-    Raises:
-        ValueError: unreadable, or no rotation with a scale and a translation.
     """
     if text == IDENTITY:
         return shifted(torch.zeros(3))
@@ -137,11 +134,8 @@ def check_frame(
 ) -> FrameCheck:
     """Render training views at a low resolution, and search for a better world if they do not fit.
 
-    Args:
-        scene: with photographs.
-        render: renders a view with the Gaussians of the file under scene_from_file.
-        means: [N, 3] of opaque Gaussians, in the file's world.
-        nerfstudio: scene_from_file by nerfstudio's `dataparser_transforms.json`, if there is one.
+    `render` draws a view with the Gaussians under scene_from_file, `means` [N, 3] are the opaque ones in the file's
+    world; `nerfstudio` is the scene_from_file of nerfstudio's `dataparser_transforms.json`, if there is one.
     """
     views = [view for view in scene.train if view.lens is None]
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]

@@ -63,11 +63,7 @@ def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) 
 
 
 def check_range(low: float, high: float, **options: float | None) -> None:
-    """Refuse a value outside a range.
-
-    Raises:
-        ValueError: "--NAME is VALUE; it must be from LOW to HIGH".
-    """
+    """Raise a ValueError "--NAME is VALUE; it must be from LOW to HIGH" for a value outside."""
     for name, value in options.items():
         if value is not None and not low <= value <= high:
             raise ValueError(f"--{name.replace('_', '-')} is {value}; it must be from {low} to {high}")

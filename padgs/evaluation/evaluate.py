@@ -29,18 +29,14 @@ def evaluate(
     on_view: OnView | None = None,
     extra: ExtraMetrics | None = None,
 ) -> Scores:
-    """Render each view and compare it with its ground truth.
+    """Render each test view and compare it with its ground truth; a Failure (nan) if a render is not finite.
 
     Args:
         render: `render` of a trained method.
-        views: the test views; each has an image, and may have a mask.
+        views: each has an image, and may have a mask.
         protocol: metrics, weights and crop.
         on_view: called with each view, its truth and its render (clamped, 8-bit, not cropped), to save images.
         extra: computes further metrics of each view.
-
-    Raises:
-        ValueError: no views, a view without an image, or a render of another size than its view.
-        Failure: a render has non-finite values (status nan).
     """
     if not views:
         raise ValueError("no test views to evaluate; give the scene a test split")

@@ -155,10 +155,7 @@ def lpips(
     """Return LPIPS of images [H, W, 3] in [0, 1]: the standard value, or the mean of its map under a weight [H, W].
 
     The weight, such as solid angle x mask, is the mask where it is not given. Receptive fields are large, so masked
-    pixels of the image are first replaced by those of the target.
-
-    Raises:
-        LpipsUnavailable: no weights on this machine, or an image too small for the network.
+    pixels of the image are first replaced by those of the target. LpipsUnavailable: no weights, or too small an image.
     """
     if mask is not None:
         image = torch.lerp(target, image, mask[..., None])
@@ -170,12 +167,7 @@ def lpips(
 
 
 def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
-    """Return the LPIPS network of a name in `NETS`, loaded once per device.
-
-    Raises:
-        ValueError: unknown network.
-        LpipsUnavailable: there are no weights; the message says how to get them.
-    """
+    """Return the LPIPS network of a name in `NETS`, loaded once per device; LpipsUnavailable names a way out."""
     if net not in NETS:
         raise ValueError(f"unknown LPIPS network {net!r}; known: {', '.join(NETS)}")
     loaded = _load(net, torch.device(device))

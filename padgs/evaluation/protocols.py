@@ -78,13 +78,10 @@ ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released 
 
 
 def protocol_from_options(name: str, /, **options: Any) -> Protocol:
-    """Return a protocol of `PROTOCOLS` with some fields replaced.
+    """Return a protocol of `PROTOCOLS` with some fields replaced; a ValueError lists the known names.
 
     >>> protocol_from_options("paper", lpips="none").lpips
     'none'
-
-    Raises:
-        ValueError: unknown protocol, option or value; the message lists the known ones.
     """
     if name not in PROTOCOLS:
         raise ValueError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")

@@ -138,9 +138,6 @@ def pad_panorama(image: Tensor, margin: int) -> Tensor:
     """Return a panorama [H, W, ...] continued by `margin` pixels on each side, across its seam and its poles.
 
     Left and right it wraps. Beyond a pole it continues down the opposite meridian: row -k is row k - 1 rolled by W / 2.
-
-    Raises:
-        ValueError: it has fewer rows than `margin`, or an odd width, which has no opposite column.
     """
     height, width = image.shape[:2]
     if height < margin or width % 2:

@@ -96,13 +96,8 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
 def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:
     """Return an untrained method, as `padgs-run method=NAME SETTINGS` would train it.
 
-    Args:
-        name: a choice of `method`: any that the README lists.
-        settings: as on the command line, of its options, rendering, loss or seed: "method.sh_degree=1", "seed=2".
-
-    Raises:
-        ConfigError: an unknown key, or an invalid value.
-        HydraException: an unknown method.
+    Settings are as on the command line, of its options, rendering, loss or seed: "method.sh_degree=1", "seed=2".
+    It may raise a ConfigError, or a HydraException for an unknown method.
     """
     with composing():
         return build_method(configuration([f"method={name}", *settings]))

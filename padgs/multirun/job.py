@@ -130,11 +130,7 @@ class BoardEntry(Callback):
 
 
 def job_of_many(composed: DictConfig) -> str:
-    """Do one run of a multirun; raises nothing but an interruption, so that the other jobs go on.
-
-    Returns:
-        Its status, one of `padgs.results.STATUSES` or below.
-    """
+    """Do one run of a multirun and return its status; only an interruption is raised, so that the other jobs go on."""
     answer_signals()  # of a process of its own
     hydra = HydraConfig.get()
     board = Board(Path(hydra.sweep.dir))

@@ -25,10 +25,7 @@ def wait_for_jobs(jobs: Sequence[Any], stop_requested: Callable[[], bool]) -> li
     """Wait until submitit's jobs have left the queue; if a stop is requested, take those that wait out of it.
 
     submitit asks `sacct`, which answers nothing on clusters without accounting, and takes preempted jobs for ended ones
-    that Slurm has put back into the queue.
-
-    Returns:
-        Positions of jobs that were cancelled before they began.
+    that Slurm has put back into the queue. Returns the positions of jobs that were cancelled before they began.
     """
     cancelled = False
     while (left := queued()) is None or left & {job.job_id for job in jobs}:

@@ -59,7 +59,7 @@ def render(
     absgrad: Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
-    """Render the Gaussians from the camera of the view.
+    """Render the Gaussians from the camera of the view; a ValueError for inputs that break the contract.
 
     Args:
         gaussians: N Gaussians in the world frame, float32 (any backend) or float64 (torch only).
@@ -72,9 +72,6 @@ def render(
             pixels of |dL/dmean| through each pixel alone, which do not cancel (`with_absgrad` of backend torch).
         backend: a name of `BACKENDS`, or auto: cpu or cuda, by the device, for float32 tensors if the library is built;
             torch otherwise (with one warning if the library is missing).
-
-    Raises:
-        ValueError: unknown backend, or inputs that break the contract.
     """
     request = make_request(gaussians, view, options, background, mean_offsets, absgrad)
     rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, gaussians.means), "backend")

@@ -69,8 +69,7 @@ def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> No
 def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str] | None = None) -> State:
     """Read a checkpoint that `save` wrote, with all tensors on one device; keys of `run` must be those of its identity.
 
-    Raises:
-        CheckpointError: a file is missing, truncated, changed, of another format, or of another run.
+    A CheckpointError says that a file is missing, truncated, changed, of another format, or of another run.
     """
     manifest = _manifest(folder)
     for what, wanted in (run or {}).items():

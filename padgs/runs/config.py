@@ -51,11 +51,7 @@ class DataConfig(DataSettings):
 
     @property
     def synthetic(self) -> SyntheticOptions:
-        """Options of a generated scene.
-
-        Raises:
-            ConfigError: an unknown key, or a value of the wrong type.
-        """
+        """Options of a generated scene; a ConfigError names an unknown key or a value of the wrong type."""
         width = {} if self.width is None else {"width": self.width}
         return typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
 
@@ -194,11 +190,7 @@ class RunConfig(Settings):
 
 
 def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
-    """Return the typed configuration of values that Hydra composed.
-
-    Raises:
-        ConfigError: an unknown key or name (the known ones are listed), or a value of the wrong type.
-    """
+    """Return the typed configuration of values that Hydra composed; a ConfigError names the key and the known ones."""
     known = (*default_fields(), "method", "protocol")
     for key in values:
         if key not in known:
@@ -294,10 +286,6 @@ def choose_device(name: str, render: RenderConfig) -> torch.device:
     """Return the device for `run.device`; auto is a GPU that can render these settings, else the CPU.
 
     Warns if a GPU is not used because its library is missing or was not compiled for it.
-
-    Raises:
-        ValueError: cuda without a GPU, or backend cuda on the CPU.
-        OSError: the library of backend cuda is not built.
     """
     if (name == "cuda" or render.backend == "cuda") and not torch.cuda.is_available():
         why = "torch finds no GPU with a working driver" if torch.version.cuda else "this torch is built without CUDA"

@@ -38,11 +38,7 @@ class Picture:
 
 
 def draw(method: Method, view: View) -> Picture:
-    """Render a view of a trained method as arrays.
-
-    Raises:
-        RuntimeError: the method has no model yet.
-    """
+    """Render a view of a trained method as arrays."""
     rendering = method.render(view)
     image, depth = rendering.image.clamp(0, 1), rendering.depth
     return Picture(*(tensor.float().cpu().numpy() for tensor in (image, depth, 1 - rendering.transmittance)))
@@ -68,10 +64,8 @@ class LoadedRun:
     def scene(self) -> Scene:
         """The scene that the run was trained on, loaded at first access.
 
-        Warns if the data have changed since: poses and units may differ from the model's.
-
-        Raises:
-            DataError: the data have moved; `load_run(folder, data_path=...)` says where they are.
+        Warns if the data have changed since: poses and units may differ from the model's. If they have moved, a
+        DataError says so, and `load_run(folder, data_path=...)` says where they are.
         """
         scene = load_scene(self.config, choose_device(self.config.run.device, self.config.render))
         if difference := self._difference(scene):
@@ -96,9 +90,7 @@ class LoadedRun:
     def renewed(self) -> LoadedRun | None:
         """Return the run as training has left it since, on the same scene; None if nothing has changed.
 
-        Raises:
-            CheckpointError: the checkpoint cannot be read, perhaps because a new one is being written.
-            RunFolderError, ResultError, OSError: another file cannot be read.
+        An error that a file cannot be read may be over when a new checkpoint has been written.
         """
         if checkpoint.digest(self.files.checkpoint) == self.digest and self.files.result() == self.result:
             return None
@@ -112,22 +104,14 @@ class LoadedRun:
         return draw(self.method, view)
 
     def score(self, protocol: str) -> Scores:
-        """Score the test views under a protocol of the run or a built-in one.
-
-        Raises:
-            ValueError: unknown protocol, or there are no test views.
-        """
+        """Score the test views under a protocol of the run or a built-in one."""
         rules = {**PROTOCOLS, **self.config.protocols}
         if protocol not in rules:
             raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(rules)}")
         return score(self.method.render, self.scene, {protocol: rules[protocol]}, None)[protocol]
 
     def camera_path(self, frames: int) -> list[View]:
-        """Return `frames` views along a path through the training cameras in their order, evenly spaced in number.
-
-        Raises:
-            ValueError: fewer than two training views or frames.
-        """
+        """Return `frames` views along a path through the training cameras in their order, evenly spaced in number."""
         views = self.scene.train
         if len(views) < 2 or frames < 2:
             raise ValueError(f"a path of {frames} frames through {len(views)} views; it takes at least two of both")
@@ -168,17 +152,10 @@ class LoadedRun:
 
 
 def load_run(folder: str | Path, *, data_path: str | Path | None = None, device: str = "auto") -> LoadedRun:
-    """Load a run folder.
+    """Load a run folder: `config.yaml` and `checkpoint/`, as `padgs-run` writes them.
 
-    Args:
-        folder: with `config.yaml` and `checkpoint/`, as `padgs-run` writes them.
-        data_path: folder of the data set if it has moved.
-        device: auto, cpu or cuda.
-
-    Raises:
-        RunFolderError: not a run folder, or without a checkpoint.
-        CheckpointError, ResultError, ConfigError: a file is damaged or of another version.
-        ValueError, OSError: the device does not exist or cannot render this.
+    `data_path` is the folder of the data set if it has moved, `device` is auto, cpu or cuda. A RunFolderError says that
+    it is no run folder; CheckpointError, ResultError and ConfigError name a file that is damaged or of another version.
     """
     store = RunStore(Path(folder))
     settings = store.path / results.CONFIG_NAME

@@ -65,17 +65,12 @@ def run(
     """Do what is missing of a run, and show its result.
 
     Args:
-        config: the run.
+        config, scene: the run, and its scene as `load_scene(config, start(config))` returns it; loaded if None.
         console: receives progress and the result.
         callback: is told of the folder and of checkpoints.
-        scene: as `load_scene(config, start(config))` returns it; loaded if None.
         brief: show only progress.
 
-    Raises:
-        DataError: the input cannot be used.
-        ResultError, CheckpointError, RunFolderError: files of the run cannot be read or written.
-        RunBusy: another process works on this run.
-        Interrupted: stopped from outside; starting the run again resumes it.
+    Errors of the input and of files are `REPORTED`. Starting the run again after `Interrupted` resumes it.
     """
     scene = load_scene(config, start(config)) if scene is None else scene
     store = RunStore.of(config, scene)

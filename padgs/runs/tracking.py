@@ -56,12 +56,8 @@ class Tracker:
     ) -> None:
         """Import and connect nothing yet.
 
-        Args:
-            options: the server or database.
-            runs: the folder of run folders.
-            experiment: of mlflow; empty = DEFAULT_EXPERIMENT.
-            say: shows a line to the user; called at most once.
-            multirun: name of the parent run in mlflow; empty = none.
+        `runs` is the folder of run folders, `experiment` and `multirun` the names of the experiment and of the parent
+        run in mlflow (empty: DEFAULT_EXPERIMENT, and none); `say` shows a line to the user, at most once.
         """
         self._runs, self.name = runs.absolute(), experiment or DEFAULT_EXPERIMENT
         self._uri = options.uri or f"sqlite:///{self._runs / 'mlflow.db'}"

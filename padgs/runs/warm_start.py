@@ -49,11 +49,8 @@ class WarmStart:
     ) -> State:
         """Return the state that the run ended with; raise a ConfigError for other data, another stress or a change.
 
-        Args:
-            fingerprint: of the scene of the new run.
-            fingerprint_at: returns the same for another `data.width`; called only if the fingerprints differ.
-            device: of the tensors.
-            stress: of the new run, as in its configuration; None for none.
+        `fingerprint` is that of the scene of the new run; `fingerprint_at` returns the same for another `data.width`,
+        and is called only if the fingerprints differ; `stress` is that of the new run, as in its configuration.
         """
         store = RunStore(Path(self.run))
         try:

@@ -220,11 +220,7 @@ class Corrections(nn.Module):
     """
 
     def __init__(self, scene: Scene, options: TrainOptions) -> None:
-        """Begin without corrections.
-
-        Raises:
-            ValueError: poses are learned, but two views have the same name; a lens is learned, but of no panorama.
-        """
+        """Begin without corrections; a ValueError if poses or a lens cannot be learned on this scene."""
         super().__init__()
         self._options = options
         views = len(scene.train) if options.exposures == LEARNED else 0

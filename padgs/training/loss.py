@@ -43,14 +43,10 @@ def photometric_loss(
     """Return Eq. 16, a scalar; differentiable by `image`, and by `target` if it requires a gradient.
 
     Args:
-        image: [H, W, 3], not clamped.
-        target: [H, W, 3].
+        image, target: [H, W, 3], not clamped.
         weight: [H, W], or [H, 1] where all pixels of a row weigh the same; >= 0, not 0 everywhere.
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
-
-    Raises:
-        ValueError: unknown normalisation.
     """
     if normalisation not in NORMALISATIONS:
         raise ValueError(f"unknown normalisation {normalisation!r}; known: {', '.join(NORMALISATIONS)}")
@@ -104,8 +100,7 @@ def pixel_weight(
 ) -> Tensor:
     """Return the weight W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without a mask [H, W].
 
-    Raises:
-        ValueError: unknown name, or a mask that leaves no pixel.
+    A ValueError says that the mask leaves no pixel.
     """
     if name not in ROW_WEIGHTS:
         raise ValueError(f"unknown weight {name!r}; known: {', '.join(ROW_WEIGHTS)}")

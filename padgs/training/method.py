@@ -78,12 +78,7 @@ class Method(ABC):
 
         The caller may stop between two records and call `state()` then. With a budget of seconds, a few steps are
         taken first and thrown away; they fix the length of the schedule. They and building the initial model count as
-        training time.
-
-        Args:
-            scene: needs at least one training view.
-            budget: length of the training and size of the model.
-            stage: context manager entered with the name of each part of an iteration, see `Trainer`.
+        training time. `stage` is entered with the name of each part of an iteration, see `Trainer`.
 
         Raises:
             ValueError: at once: the method cannot train on this scene or within this budget.

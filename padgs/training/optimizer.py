@@ -57,8 +57,7 @@ def _change_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam, change
 def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collection[str]) -> None:
     """Load the `state_dict` of another model, whose `growing` tensors may have another number of rows.
 
-    Raises:
-        ValueError: a tensor is missing, or has another shape than in this model.
+    A ValueError names a tensor that is missing or has another shape.
     """
     count = len(tensors[first]) if (first := next(iter(growing))) in tensors else 0
     for name, own in model.state_dict().items():
@@ -132,8 +131,7 @@ class Optimizer:
     def read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
         """Return the loss as a number; on a GPU only every few iterations, because the host has to wait for it.
 
-        Raises:
-            Failure: nan, naming a parameter or one of `inputs`.
+        A Failure (nan) names a parameter or one of `inputs`.
         """
         if loss.device.type != "cpu" and iteration % READ_EVERY and not self.is_checked(iteration):
             return loss.detach()

@@ -103,11 +103,7 @@ def depth_of(view: View, device: torch.device | str = "cpu") -> Tensor | None:
 
 
 def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
-    """Return the weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is in `ROW_WEIGHTS`.
-
-    Raises:
-        ValueError: the mask has another size than the view, or is 0 everywhere.
-    """
+    """Return the weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is in `ROW_WEIGHTS`."""
     mask = view.mask(device=device)
     mask = None if mask is None else _checked_size(view, "mask", mask)
     try:

@@ -74,9 +74,7 @@ class Workload:
     def trainer(self, *, grows: bool = False, stage: Stage = nullcontext) -> Trainer:
         """Return a trainer with learning rates near 0, so that all iterations do the same work.
 
-        Args:
-            grows: densify in every iteration; otherwise statistics are collected and never used.
-            stage: see `Trainer`.
+        `grows`: densify in every iteration; otherwise statistics are collected and never used.
         """
         grow_from = 0 if grows else NEVER
         growth = GrowthOptions(statistics_from=0, grow_from=grow_from, grow_until=NEVER, grow_every=1 if grows else 100)

@@ -60,13 +60,9 @@ def sample_cameras(views: Sequence[View], count: int = VIEWS) -> list[View]:
 
 @torch.no_grad()
 def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: str, unit: float) -> Splats:
-    """Return the explicit Gaussians that fit the anchors best in these views; invisible Gaussians are dropped.
+    """Return the explicit Gaussians that fit A anchors with K Gaussians each best in these sampled views.
 
-    Args:
-        model: A anchors with K Gaussians each.
-        views: sampled views.
-        options, backend: of the renderer.
-        unit: of the scene, in world units.
+    Invisible Gaussians are dropped; `options` and `backend` are of the renderer, `unit` is the scene scale.
     """
     count = len(model) * model.options.offsets
     zeros = model.positions.new_zeros
@@ -158,15 +154,9 @@ def distill(
     steps: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Train splats, in place, on renders of another model.
+    """Train splats, in place, on renders of the training views of a scene by another model.
 
-    Args:
-        splats: student.
-        render_teacher: renders the target of a view.
-        scene: its training views are rendered; their images are not used.
-        config: of the student's renderer.
-        steps: iterations.
-        progress: called with the number of completed iterations.
+    `config` is that of the student's renderer; `progress` is called with the number of completed steps.
     """
 
     def target(view: View) -> View:

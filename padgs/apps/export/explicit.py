@@ -47,20 +47,16 @@ def export_run(
     crop: Sequence[float] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
-    """Convert a run to explicit Gaussians, in the world of its scene.
+    """Convert a run of any method with Gaussians to explicit ones, in the world of its scene.
 
     Args:
-        run: of any method with Gaussians.
+        run: whose data set is needed, unless the Gaussians are written as trained.
         distillation_steps: iterations in which baked anchors are trained on renders of the run.
         upright: rotate the world so that the cameras' up is -y, as viewers expect.
         smooth: include the 3D filter (`padgs.methods.splats.smoothing_filter`) in the scales, if there is one;
             viewers have no such filter, and show sharp Gaussians as needles.
         crop: lowest and highest x y z; Gaussians with their mean outside are left out.
         progress: called with the number of completed distillation steps.
-
-    Raises:
-        ValueError: the run has no Gaussians, or none in the crop.
-        DataError: the data set is missing, and needed for more than Gaussians as trained.
     """
     model = run.method.model
     config = run.config.render

@@ -34,16 +34,10 @@ _NEEDED = (*_POSITION, *_COLOR, *_LAST)
 
 
 def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> None:
-    """Write Gaussians to a file; its suffix chooses the format.
+    """Write Gaussians to a .ply or a format of `CONVERTED`, chosen by the suffix; only active harmonics are written.
 
-    Args:
-        path: *.ply, or one of `CONVERTED`; an existing file is replaced when the new one is complete.
-        splats: Gaussians, of which only active harmonics are written.
-        comments: lines of a PLY header; non-ASCII characters are escaped.
-        start: [2, 3] initial position and target of the viewer in an .html; None: its default.
-
-    Raises:
-        ValueError: unknown suffix, or the converter is not installed or fails.
+    `comments` are lines of a PLY header, `start` [2, 3] the initial position and target of the viewer in an .html.
+    An existing file is replaced when the new one is complete.
     """
     check_suffix(path)
     if not path.name.endswith(CONVERTED):
@@ -78,11 +72,7 @@ def _convert(source: Path, target: Path, *more: str) -> None:
 
 
 def check_suffix(path: Path) -> None:
-    """Check early that `write_splats` supports a file.
-
-    Raises:
-        ValueError: unknown suffix, or the converter is not installed.
-    """
+    """Raise a ValueError early for an unknown suffix, or if the converter that it needs is not installed."""
     if not path.name.endswith((".ply", *CONVERTED)):
         raise ValueError(f"{path} has an unknown format; known: .ply, {', '.join(CONVERTED)}")
     if path.name.endswith(CONVERTED) and shutil.which(CONVERTER) is None:
@@ -95,9 +85,7 @@ def check_suffix(path: Path) -> None:
 def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     """Read Gaussians from a file; `unit` is the scene scale, which files do not contain.
 
-    Raises:
-        DataError: no readable PLY of Gaussians.
-        ValueError: a file in `CONVERTED`, and the converter is not installed or fails.
+    A DataError says that a PLY holds no Gaussians, a ValueError that the converter is not installed or fails.
     """
     if path.name.endswith(CONVERTED):
         check_suffix(path)

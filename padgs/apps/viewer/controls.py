@@ -91,11 +91,10 @@ class FilmControls:
     def __init__(
         self, client: Any, folder: Path, model: Path, origin: Tensor, pose: Callable[[], Tensor], may_write: bool
     ) -> None:
-        """Add the controls.
+        """Add the controls to a `viser.ClientHandle`.
 
         Args:
-            client: a `viser.ClientHandle`.
-            folder: of the run, or beside a file.
+            client, folder: the page, and the folder of the run or beside a file.
             model: run or file, as `padgs render` opens it.
             origin: of the scene in the world of its data set, in which paths are stored.
             pose: returns the current cam_from_world.

@@ -74,14 +74,9 @@ class Page:
     def __init__(
         self, client: Any, renderers: Sequence[RunRenderer], box: Box, lock: threading.Lock, *, may_stop: bool
     ) -> None:
-        """Add the controls.
+        """Add the controls for one run or two to a `viser.ClientHandle`, with an initial crop `box`.
 
-        Args:
-            client: a `viser.ClientHandle`.
-            renderers: of one run, or two.
-            box: initial crop.
-            lock: held while rendering, because pages share the processor.
-            may_stop: whether the page may stop training.
+        `lock` is held while rendering, because pages share the processor; `may_stop`: the page may stop training.
         """
         self._client, self._renderers, self._lock = client, tuple(renderers), lock
         self._changed, self._closed = threading.Event(), threading.Event()
@@ -149,12 +144,8 @@ class Page:
             self._client.camera.wxyz = wxyz_of(world_from_cam)
 
     def state(self) -> PageState:
-        """Return the state of controls and camera.
-
-        Raises:
-            ValueError: a value that the page does not offer; any message may come from a browser.
-        """
-        for name, offer in self._offers.items():
+        """Return the state of controls and camera; a ValueError for values that the page does not offer."""
+        for name, offer in self._offers.items():  # any message may come from a browser
             if (value := getattr(self, f"_{name}").value) not in offer:
                 raise ValueError(f"{name} = {str(value)[:40]!r} is not one of the page's choices; choose one of them")
         crop = self._crop.box
@@ -278,20 +269,10 @@ UPDATE_SECONDS = 1.0  # between searches for a newer checkpoint
 
 @contextmanager
 def show_runs(server: Server, runs: Sequence[LoadedRun]) -> Iterator[dict[int, Page]]:
-    """Show one run, or two to compare, in all connected browsers until the context ends.
+    """Show one run, or two of a scene to compare, in all connected browsers until the context ends.
 
     Runs in training are shown from their last checkpoint, and followed. Pages can stop training if the server is local,
-    and change nothing else.
-
-    Args:
-        server: of `start_server`.
-        runs: of the same scene.
-
-    Returns:
-        The page of each connected client, by its number.
-
-    Raises:
-        DataError: the data set is missing.
+    and change nothing else. Yields the page of each connected client, by its number.
     """
     warnings.filterwarnings(
         "ignore", message=r"Queued .* on a closed connection|\[viser\]"

@@ -87,13 +87,10 @@ class RunRenderer:
     def render(
         self, options: ViewOptions, cam_from_world: Tensor, width: int, height: int, resolution: float = 1.0
     ) -> np.ndarray:
-        """Render an image [h, w, 3] uint8.
+        """Render an image [h, w, 3] uint8 from `cam_from_world` [4, 4]; panoramas are padded with black.
 
-        Args:
-            options: of the render.
-            cam_from_world: [4, 4].
-            width, height: pixels at full resolution; panoramas are padded with black.
-            resolution: factor on width and height; low-pass filters stay those of the full resolution, or grow.
+        `width` and `height` are pixels at full resolution; `resolution` is a factor on both, under which low-pass
+        filters stay those of the full resolution, or grow.
         """
         full, lens = (
             self._lens(options, max(2, round(s * width)), max(2, round(s * height))) for s in (1.0, resolution)

@@ -46,16 +46,10 @@ class Server:
 def serve(
     load_runs: Callable[[], Sequence[LoadedRun]], *, host: str = LOCAL, port: int = PORT, browse: bool = False
 ) -> None:
-    """Serve a page, print its address, and show runs until Ctrl-C.
+    """Serve a page, print its address, and show runs until Ctrl-C; other arguments as in `start_server`.
 
-    Args:
-        load_runs: returns one run, or two to compare; called while browsers load the page, because both take seconds.
-        host, port: as in `start_server`.
-        browse: also open the page in a browser, if it is local.
-
-    Raises:
-        ValueError, OSError: from `start_server` or `load_runs`.
-        KeyboardInterrupt: on Ctrl-C.
+    `load_runs` returns one run, or two to compare; it is called while browsers load the page, because both take
+    seconds. `browse`: also open the page in a browser, if it is local.
     """
     with start_server(host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)
@@ -78,10 +72,6 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
     Args:
         host: `LOCAL` serves this machine only.
         port: the first port to try; the next free one is used.
-
-    Raises:
-        ValueError: the extra `view` is not installed.
-        OSError: the address cannot be used.
     """
     viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
     port = free_port(host, port)
@@ -108,13 +98,8 @@ def guard(token: str, *, is_local: bool) -> Iterator[list[int]]:
     """Guard the viser servers that start inside the context: only holders of the token are served.
 
     viser has no hook for this; it starts its server by `websockets.asyncio.server.serve`, which is replaced meanwhile.
-
-    Args:
-        token: expected in the address; a cookie keeps it for the websocket, whose address viser builds without it.
-        is_local: also refuse all host names but those of this machine, against DNS rebinding.
-
-    Returns:
-        The ports of guarded servers.
+    The token is expected in the address; a cookie keeps it for the websocket, whose address viser builds without it.
+    `is_local`: also refuse all host names but those of this machine, against DNS rebinding. Yields the guarded ports.
     """
     from websockets.asyncio import server as websockets
 
@@ -158,11 +143,7 @@ def is_foreign(headers: Any, *, is_local: bool) -> bool:
 
 
 def free_port(host: str, first: int) -> int:
-    """Return the first free port from `first` on; viser would wait for ever for one that cannot be had.
-
-    Raises:
-        OSError: the host is no address of this machine, or no port is free.
-    """
+    """Return the first free port from `first` on; viser would wait for ever for one that cannot be had."""
     reason = f"the ports from {first} on are taken"
     for port in range(first, min(first + PORTS_TRIED, 65536)):
         try:
@@ -192,11 +173,7 @@ def network_address() -> str:
 
 
 def viser_module() -> ModuleType:
-    """Import viser.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """Import viser; a ValueError says how to install it."""
     try:
         import viser
     except ImportError as error:
@@ -213,8 +190,7 @@ def has_screen() -> bool:
 def wait_for_checkpoint(folder: str | Path) -> None:
     """Return when a run has a checkpoint, or will have none; opening it then reports the reason.
 
-    Raises:
-        ValueError: the run was started, but no process trains it.
+    A ValueError says that the run was started, but no process trains it.
     """
     from padgs.runs.store import RunStore
 

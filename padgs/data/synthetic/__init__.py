@@ -32,11 +32,7 @@ __all__ = ["SCENES", "SyntheticOptions", "SyntheticTruth", "generate", "load"]
 
 
 def load(path: str | Path, options: DataOptions) -> Scene:
-    """Load the synthetic scene `path`, or the one in `options.generator` if it is empty; the entry of LOADERS.
-
-    Raises:
-        DataError: unknown scene or field, or an invalid value.
-    """
+    """Load the synthetic scene `path`, or the one in `options.generator` if it is empty; the entry of LOADERS."""
     settings = dict(options.generator)
     if str(path) not in ("", "."):
         settings["scene"] = str(path)

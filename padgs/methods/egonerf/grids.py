@@ -197,24 +197,16 @@ def interval_lengths(distances: Tensor) -> Tensor:
 
 
 def refined(distances: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
-    """Return distances of fine samples [B, F]: quantiles of the weights of the coarse samples.
+    """Return distances of fine samples [B, F]: quantiles, at shares [B, F], of the weights [B, S] of coarse samples.
 
-    Args:
-        distances: [B, S] increasing.
-        weights: [B, S] >= 0; weight k lies between the midpoints around distance k, the outer two are ignored.
-        shares: [B, F] in [0, 1], of the total weight.
+    Weight k lies between the midpoints around distance k of [B, S]; the outer two are ignored.
     """
     midpoints = (distances[:, 1:] + distances[:, :-1]) / 2
     return inverse_cdf(midpoints, weights[:, 1:-1] + MIN_WEIGHT, shares)
 
 
 def inverse_cdf(edges: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
-    """Return quantiles [B, F] of a piecewise constant density.
-
-    Args:
-        edges: [B, M + 1] increasing, of the pieces.
-        weights: [B, M] > 0, mass of each piece up to a factor.
-        shares: [B, F] in [0, 1], of the mass below each quantile.
+    """Return quantiles [B, F] at shares [B, F] of a density with masses [B, M] > 0 between edges [B, M + 1].
 
     >>> inverse_cdf(torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([[1.0, 3.0]]), torch.tensor([[0.25, 0.625]])).tolist()
     [[1.0, 1.5]]
@@ -228,15 +220,10 @@ def inverse_cdf(edges: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
 
 
 def visible_shares(optical_depths: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weight of each interval of a ray, and the transmittance behind all; together 1.
+    """Return the weight [..., S] of each interval of a ray, and the transmittance [...] behind all; together 1.
 
-    weight_k = exp(-sum of the depths in front) (1 - exp(-depth_k)), exact for intervals of constant density.
-
-    Args:
-        optical_depths: [..., S] >= 0, density times length of the intervals, from front to back.
-
-    Returns:
-        weights [..., S], residual [...].
+    weight_k = exp(-sum of the depths in front) (1 - exp(-depth_k)), exact for intervals of constant density; depths
+    [..., S] are density times length, from front to back.
 
     >>> weights, residual = visible_shares(torch.tensor([0.6931472, 0.6931472]))
     >>> weights.tolist(), residual.item()

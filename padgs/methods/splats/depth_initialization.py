@@ -55,13 +55,8 @@ def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator, m
 
     Pixels are sampled by solid angle and mask. Their depth is interpolated from the cloud as that view sees it
     (Shepard: inverse depth, weights 1 / angle^2, so that planes stay planes) and refined by `plane_sweep`. A pixel
-    farther from all points than the points' spacing is dropped: it may show the sky.
-
-    Args:
-        scene: with images; points that are not finite or at a camera centre are ignored.
-        count: of points.
-        generator: samples pixels, on the CPU.
-        measured: take depths from the depth maps of views that have one.
+    farther from all points than the points' spacing is dropped: it may show the sky. Points that are not finite or at a
+    camera centre are ignored. `measured`: take depths from the depth maps of views that have one.
     """
     missing = count - len(scene.points)
     cloud = scene.points[torch.isfinite(scene.points).all(-1)].double().cpu()

@@ -75,11 +75,8 @@ class NativeImage(ABC):
     def rasterize(cls, request: Request) -> Rendering:
         """Render the request, differentiably.
 
-        Raises:
-            ValueError: the library does not take these tensors or options.
-            OSError: the library was not built.
-            RuntimeError: the library was not compiled for this GPU.
-            torch.cuda.OutOfMemoryError: too little GPU memory; `options.max_instances` makes the strips smaller.
+        OSError: the library was not built; RuntimeError: it was not compiled for this GPU. With too little GPU memory,
+        `options.max_instances` makes the strips smaller.
         """
         leaves = Leaves(
             **vars(request.gaussians),
