@@ -38,7 +38,7 @@ FIELD_OF_VIEW = 75.0
 
 def cut_view_options(options: RenderOptions) -> RenderOptions:
     """Return the renderer options for views cut from panoramas with these options."""
-    return replace(options, cubemap=False, face_size=None).on_finer_pixels(FINENESS)
+    return replace(options, cubemap=False).on_finer_pixels(FINENESS)
 
 
 class CutModel(SplatModel):

@@ -73,7 +73,7 @@ LIMITS: dict[object, tuple[int, int]] = {
     "seconds": (0, 10**8),
     **dict.fromkeys(("threads", "jobs"), (1, 1024)),
     "prefetch_threads": (0, 1024),
-    **dict.fromkeys(("width", "height", "face_size"), (0, 2**16)),
+    **dict.fromkeys(("width", "height"), (0, 2**16)),
     **dict.fromkeys(("views", "samples", "objects", "rooms", "spokes", "nodes", "pass", "filter"), (0, 10**4)),
     **dict.fromkeys(("features", "hidden", "offsets", "components", "levels", "frequencies"), (0, 1024)),
     **dict.fromkeys(("bytes", "cap", "instances"), (0, 10**15)),

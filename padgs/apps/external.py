@@ -27,6 +27,7 @@ from padgs.apps.frame_check import (
     read_transform,
     shifted,
 )
+from padgs.checks import unknown
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.path_file import TRANSFORMS
 from padgs.data.formats.transforms import transforms_file
@@ -129,7 +130,9 @@ class ExternalRun(LoadedRun):
             transform: scene_from_file for `read_transform`, in the world of the data set; empty: the identity.
             device: auto, cpu or cuda.
         """
-        render, notes = lookup_rays(rays), list[str]()
+        if rays not in RAYS:
+            raise ValueError(unknown("--rays", rays, RAYS))
+        render, notes = RAYS[rays], list[str]()
         config = None if config is None else replace(config, render=render)
         moved = read_transform(transform, config and _transforms_json(config)) if transform else None
         splats = read_splats(file)
@@ -202,13 +205,6 @@ def open_model(
     if config is not None and not (found := run.check()).fits:
         run.notes += (str(found),)
     return run
-
-
-def lookup_rays(rays: str) -> RenderConfig:
-    """Return the renderer settings of a name of `RAYS`; a ValueError lists the known ones."""
-    if rays not in RAYS:
-        raise ValueError(f"unknown --rays {rays!r}; known: {', '.join(RAYS)}")
-    return RAYS[rays]
 
 
 def scene_without_photographs(splats: Splats, file: Path) -> Scene:

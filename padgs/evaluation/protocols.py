@@ -9,8 +9,7 @@ All protocols compare 8-bit images: the render is clamped to [0, 1] and rounded 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
 
 from padgs.checks import check, check_known
 from padgs.evaluation.lpips import INPUTS, NETS
@@ -48,6 +47,7 @@ class Protocol:
     def rows(self, height: int) -> int:
         """Return how many rows of an image are evaluated; a row that the crop touches is not.
 
+        >>> from dataclasses import replace
         >>> replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP).rows(1024)
         959
         """
@@ -75,20 +75,3 @@ PROTOCOLS = {
     ),
 }
 ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released evaluation cuts rows >= 959 of 1024
-
-
-def protocol_from_options(name: str, /, **options: Any) -> Protocol:
-    """Return a protocol of `PROTOCOLS` with some fields replaced; a ValueError lists the known names.
-
-    >>> protocol_from_options("paper", lpips="none").lpips
-    'none'
-    """
-    if name not in PROTOCOLS:
-        raise ValueError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
-    known = [field.name for field in fields(Protocol) if field.name != "name"]
-    unknown = [option for option in options if option not in known]
-    if unknown:
-        raise ValueError(f"unknown option {unknown[0]!r} of protocol {name!r}; known: {', '.join(known)}")
-    if "metrics" in options:
-        options["metrics"] = tuple(options["metrics"])
-    return replace(PROTOCOLS[name], **options)

@@ -5,8 +5,6 @@ Directions are unit vectors in the camera frame (x right, y down, z forward), an
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -52,13 +50,6 @@ def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
         return (height > 0).to(directions) + 0.5 * (height == 0).to(directions)
     x = (torch.asin(height.clamp(-1, 1)) / (2 * blend) + 0.5).clamp(0, 1)
     return x * x * (3 - 2 * x)
-
-
-def check_blend(degrees: float) -> float:
-    """Return the half width of the blend band in radians; a ValueError unless it is in [0, 90) degrees."""
-    if not 0 <= degrees < 90:
-        raise ValueError(f"the blend band of the lenses is {degrees} degrees to each side; it must be in [0, 90)")
-    return math.radians(degrees)
 
 
 def _excess(theta: Tensor, coefficients: Tensor) -> Tensor:

@@ -50,7 +50,6 @@ class RenderOptions:
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none
     cubemap: bool = False  # render a panorama from the six faces of a cube, each a perspective view
-    face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: twice as fine as the panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `square_boxes`
     blending: str = "sorted"  # sorted: by distance of means; hybrid: nearest fragments of each ray sorted, others not
     core_size: int = CORE_SIZE  # hybrid: number of sorted fragments of a pixel
@@ -85,12 +84,6 @@ class RenderOptions:
             raise ValueError(
                 "projection 'erp' cannot render the faces of a cubemap; set projection to pinhole, tangent or ray"
             )
-        if self.face_size is not None and not self.cubemap:
-            raise ValueError(
-                f"face_size is {self.face_size}, but only a cubemap has faces; set cubemap=true or face_size=null"
-            )
-        if self.face_size is not None and not self.face_size >= 2:
-            raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")
 
     def on_finer_pixels(self, times: float) -> RenderOptions:
         """Return options with the same low-pass angle for a camera with `times` the pixels per radian."""

@@ -38,14 +38,14 @@ FACES = torch.tensor(
 )
 
 
-def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
+def face_camera(panorama: Panorama) -> Pinhole:
     """Return the camera of all six faces: 90 degrees, and at least a pixel more at each border.
 
     A bilinear sample at the edge of a face needs the pixel beyond it; because the same face renders that pixel,
-    neighbouring faces differ by interpolation alone. Without `face_size`, pixels across 90 degrees, the centre of a
-    face has `FINENESS` times the pixels per radian of the panorama; with as many, interpolation would blur.
+    neighbouring faces differ by interpolation alone. The centre of a face has `FINENESS` times the pixels per radian of
+    the panorama; with as many, interpolation would blur.
     """
-    focal = FINENESS * max(panorama.width / (2 * pi), panorama.height / pi) if face_size is None else face_size / 2
+    focal = FINENESS * max(panorama.width / (2 * pi), panorama.height / pi)
     size = 2 * (ceil(focal) + 1)
     return Pinhole(size, size, focal, focal, size / 2, size / 2)
 
@@ -57,9 +57,9 @@ def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
     if request.mean_offsets is not None:  # in units of the panorama, so they move the means, once for all faces
         shift = mean_shift(camera_frame(request)[0], request.mean_offsets)
         gaussians = replace(gaussians, means=gaussians.means + shift @ cam_from_world[:3, :3])
-    lens = face_camera(camera, request.options.face_size)
+    lens = face_camera(camera)
     turns = _turns(cam_from_world.dtype, cam_from_world.device)
-    options = replace(request.options, cubemap=False, face_size=None).on_finer_pixels(lens.focal / camera.focal)
+    options = replace(request.options, cubemap=False).on_finer_pixels(lens.focal / camera.focal)
     each = replace(request, gaussians=gaussians, camera=lens, options=options, mean_offsets=None)
     faces = [rasterize(replace(each, cam_from_world=turn @ cam_from_world)) for turn in turns]
     return panorama_from_faces(faces, camera, lens)

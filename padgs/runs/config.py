@@ -17,7 +17,7 @@ from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
 from padgs.data.perturb import CONDITIONS, NONE, StressOptions
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
-from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
+from padgs.evaluation.protocols import PROTOCOLS, Protocol
 from padgs.native import cuda
 from padgs.render import RenderConfig
 from padgs.runs.store import Labels
@@ -30,7 +30,6 @@ DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 DEVICES = ("auto", "cpu", "cuda")
 RETRIES = ("none", "failed")
 SWITCH = ("off", "on")
-IMAGES_ON = ("device", "cpu")
 CONTINUED = "continued"  # label of runs with `init` in tables
 
 
@@ -98,7 +97,6 @@ class RunOptions:
 
     folder: str = "runs"  # parent of the run folders
     device: str = "auto"  # auto | cpu | cuda; auto: a GPU if it can render this configuration
-    images_on: str = "device"  # device | cpu: memory for decoded panoramas, uint8 within data.cache_bytes
     jobs: int = 1  # runs at the same time on one machine: conf/launcher
     threads: int | None = None  # of one run; null = cores / jobs
     log_every: int = 10  # iterations between lines of log.jsonl
@@ -108,7 +106,7 @@ class RunOptions:
     pictures: bool = True  # save ground truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        check_known(self, device=DEVICES, images_on=IMAGES_ON)
+        check_known(self, device=DEVICES)
         counts = ("jobs", "threads", "log_every", "probe_every", "checkpoint_every")
         check(self, "at least 1", lambda count: count is None or count >= 1, *counts)
         check(self, ">= 0", lambda seconds: seconds >= 0, "checkpoint_seconds")
@@ -228,9 +226,9 @@ def _group(values: Mapping[str, Any], key: str, where: str = "") -> Mapping[str,
 
 def _protocol(name: str, rules: Mapping[str, Any]) -> Protocol:
     """Return a protocol of which some rules are given, with values of their types."""
-    given = {key: value for key, value in rules.items() if key != "name"}
-    usual = protocol_from_options(name)
-    return typed(Protocol, {**vars(usual), **given}, f"protocol.{name}")
+    if name not in PROTOCOLS:
+        raise ConfigError(unknown("protocol", name, PROTOCOLS))
+    return typed(Protocol, {**vars(PROTOCOLS[name]), **rules, "name": name}, f"protocol.{name}")
 
 
 def default_fields() -> dict[str, Any]:

@@ -139,7 +139,6 @@ class LoadedRun:
                 projection="pinhole" if panoramic else settings.projection,
                 low_pass_kind="angular" if angular else settings.low_pass_kind,
                 cubemap=False,
-                face_size=None,
                 bounds="exact",
                 wrap=True,
             )

@@ -160,12 +160,11 @@ def start(config: RunConfig) -> torch.device:
 
 
 def load_scene(config: RunConfig, device: torch.device) -> Scene:
-    """Load the scene of a run onto a device, under the run's stress; images are kept where `run.images_on` says.
+    """Load the scene of a run, and its decoded images, onto a device, under the run's stress.
 
     A DataError or another ValueError says why the input, its stress or its number of views cannot be used.
     """
-    images_on = str(device) if config.run.images_on == "device" else config.run.images_on
-    scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
+    scene = data.load(config.data.path, config.data.format, config.data.options(str(device)))
     scene = config.stress.apply(scene, config.seed).recentered().to(device)
     # Both refuse too few views, before hours of training.
     if config.budget.stop == AUTO:

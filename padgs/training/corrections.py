@@ -149,9 +149,7 @@ class PoseRefinement(nn.Module):
         ]
 
     def refined(self, view: View) -> View:
-        """Return the view at its corrected pose; differentiable. A view without a correction is a ValueError."""
-        if view.name not in self.names:
-            raise ValueError(f"view {view.name!r} has no pose to refine; known: {', '.join(self.names)}")
+        """Return one of the named views at its corrected pose; differentiable."""
         index = self.names.index(view.name)
         shift = self.scale * self.shifts[index].double()
         pose = _corrected(self.given[index], self.quaternions[index].double(), shift)

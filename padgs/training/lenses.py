@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate, normalize
 
 from padgs.geometry.camera import Panorama, RayTable
 from padgs.geometry.distortion import solid_angle_weight
-from padgs.geometry.lens import axis_direction, bend, check_blend, hemisphere_weight
+from padgs.geometry.lens import axis_direction, bend, hemisphere_weight
 from padgs.geometry.panorama import project, rays, sample_pixels
 from padgs.render import Rendering
 from padgs.render.cubemap import summed_counters
@@ -182,7 +182,7 @@ class DualLens(nn.Module):
         self.gap = nn.Parameter(torch.zeros(()))
         self.coefficients = nn.Parameter(torch.zeros(2, order))
         self.register_buffer("axis", axis_direction(axis), persistent=False)
-        self.blend, self.scene_scale, self._axis_name = check_blend(blend), scene_scale, axis
+        self.blend, self.scene_scale, self._axis_name = math.radians(blend), scene_scale, axis
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """Return the learning rates for a run of `iterations`."""

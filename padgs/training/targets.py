@@ -180,19 +180,15 @@ class TrainingViews:
 
     def next(self, progress: float) -> tuple[int, View, Target]:
         """Return index, view and target of the next step, which ends at a share of the run; prefetch the one after."""
-        index = self.next_index()
+        if self._position == len(self._order):
+            self._order = self._shuffled()
+            self._position = 0
+        index = int(self._order[self._position])
+        self._position += 1
         # At the end of an epoch the next order is unknown, and the present view is prefetched.
         upcoming = int(self._order[min(self._position, len(self._order) - 1)])
         self._scene.train[upcoming].prefetch()
         return index, *self.targets.at(index, progress)
-
-    def next_index(self) -> int:
-        """Return the index of the next view."""
-        if self._position == len(self._order):
-            self._order = self._shuffled()
-            self._position = 0
-        self._position += 1
-        return int(self._order[self._position - 1])
 
     def include_held_out(self) -> None:
         """Include the views held out in the rest of this epoch, in random order, and in those after it."""

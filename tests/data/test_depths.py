@@ -1,6 +1,7 @@
 """Depth maps: stand-ins for OB3D and TartanAir-V2 in their exact layout, folders of one's own, and their scores."""
 
 import json
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from padgs.data.capture import DepthMeaning
 from padgs.data.check import check
 from padgs.data.depths import Depth
 from padgs.data.formats.convert import convert
-from padgs.evaluation.protocols import protocol_from_options
+from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import score
 from padgs.geometry.camera import Pinhole
 from padgs.geometry.panorama import rays
@@ -223,7 +224,7 @@ def test_depth_of_one_image_is_relative_and_not_scored(measure: str, world: Worl
     ratio = view.load_depth() / truth(world, world.names.index(view.name))
     assert view.depth_is_relative and ratio.std() < 0.01 * ratio.mean()
     rendering = Rendering(view.image(), torch.zeros(32, 64), torch.ones(32, 64), torch.ones(1, dtype=torch.bool))
-    protocols = {"sphere": protocol_from_options("sphere", lpips="none")}
+    protocols = {"sphere": replace(PROTOCOLS["sphere"], lpips="none")}
     assert "abs_rel" not in score(lambda _: rendering, scene, protocols, None)["sphere"].metrics
     with pytest.raises(ValueError, match="depth maps are relative; set train.depth_kind=monocular"):
         Targets(scene.train, "uniform", depth="measured")
@@ -245,7 +246,7 @@ def test_depth_is_scored_where_it_is_known(world: World, tmp_path: Path):
         depth[28:] *= 2
         return Rendering(view.image(), torch.zeros(32, 64), depth, torch.ones(1, dtype=torch.bool))
 
-    protocols = {name: protocol_from_options(name, lpips="none") for name in ("paper", "sphere")}
+    protocols = {name: replace(PROTOCOLS[name], lpips="none") for name in ("paper", "sphere")}
     scores = score(render, scene, protocols, None)
     area = torch.cos((torch.arange(32) + 0.5 - 16) / 32 * torch.pi)
     area[:16] = area[20] = 0

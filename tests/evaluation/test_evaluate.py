@@ -13,14 +13,14 @@ from padgs.evaluation import scoring
 from padgs.evaluation.evaluate import evaluate, mean_metrics, quantized, score
 from padgs.evaluation.lpips import LpipsUnavailable
 from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
-from padgs.evaluation.protocols import PROTOCOLS, protocol_from_options
+from padgs.evaluation.protocols import PROTOCOLS
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.training.health import Failure
 
 H, W = 32, 64
-PAPER = protocol_from_options("paper", lpips="none")
-SPHERE = protocol_from_options("sphere", lpips="none")
+PAPER = replace(PROTOCOLS["paper"], lpips="none")
+SPHERE = replace(PROTOCOLS["sphere"], lpips="none")
 
 
 def view(name: str, pixels: torch.Tensor | None, mask: torch.Tensor | None = None) -> View:
@@ -60,7 +60,7 @@ def test_scores_are_those_of_saved_8_bit_images(tmp_path, image, pixels):
 
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_a_perfect_render(name, pixels):
-    protocol = protocol_from_options(name)
+    protocol = PROTOCOLS[name]
     evaluation = evaluate(lambda _: rendering(pixels / 255), [view("a", pixels)], protocol)
     for metric, value in evaluation.metrics.items():
         if "psnr" in metric:
@@ -94,7 +94,7 @@ def test_means_and_images_of_several_views(image, pixels):
     assert evaluation.protocol["name"] == "paper" and evaluation.protocol["lpips"] == "none"
 
 
-@pytest.mark.parametrize("protocol", [PAPER, SPHERE, protocol_from_options("paper", lpips="alex")])
+@pytest.mark.parametrize("protocol", [PAPER, SPHERE, replace(PROTOCOLS["paper"], lpips="alex")])
 def test_masked_pixels_change_no_protocol(image, pixels, generator, protocol):
     mask = torch.ones(H, W)
     mask[-6:] = 0
@@ -108,13 +108,13 @@ def test_masked_pixels_change_no_protocol(image, pixels, generator, protocol):
 
 def test_paper_cuts_the_bottom_off_and_sphere_hides_it(image, pixels):
     truth, stored = pixels / 255, quantized(image)
-    protocol = protocol_from_options("paper", lpips="none", bottom_crop=65 / 1024)
+    protocol = replace(PROTOCOLS["paper"], lpips="none", bottom_crop=65 / 1024)
     rows = protocol.rows(H)
     assert rows == 29  # 32 x 959 / 1024 = 29.97
     paper = score(stored, truth, None, protocol)
     assert paper["ssim"] == ssim(stored[:rows], truth[:rows]).item()
     mask = (torch.arange(H) < rows)[:, None].float().expand(H, W)
-    sphere = score(stored, truth, None, protocol_from_options("sphere", lpips="none", bottom_crop=65 / 1024))
+    sphere = score(stored, truth, None, replace(PROTOCOLS["sphere"], lpips="none", bottom_crop=65 / 1024))
     assert sphere["ws_psnr"] == ws_psnr(stored, truth, mask).item()
     assert sphere["ws_ssim"] == METRICS["ws_ssim"](stored, truth, mask).item()
     assert sphere["ws_psnr_nadir"] is None  # rows 29 to 31

@@ -104,6 +104,6 @@ def test_absgrad_of_a_cubemap(generator: torch.Generator):
     options = RenderOptions(projection="ray", low_pass=0.0)  # a pixel of the faces is smaller
     weights = torch.ones(32, 64, 3, dtype=torch.float64)
     whole = absgrads(gaussians, view, options, weights, "torch")
-    faces = absgrads(gaussians, view, replace(options, cubemap=True, face_size=64), weights, "torch")
+    faces = absgrads(gaussians, view, replace(options, cubemap=True), weights, "torch")
     seen = whole > 0.1 * whole.max()
     assert (faces[seen] / whole[seen] - 1).abs().median() < 0.2

@@ -96,8 +96,6 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
         ({"core_size": 257}, "core_size is 257; it must be from 1 to 256"),
         ({"core_size": 8}, "core_size is 8, but blending=sorted has no core; set blending=hybrid or core_size=16"),
         ({"cubemap": True}, "projection 'erp' cannot render the faces of a cubemap; set projection to pinhole"),
-        ({"projection": "ray", "face_size": 64}, "face_size is 64, but only a cubemap has faces; set cubemap=true"),
-        ({"projection": "ray", "cubemap": True, "face_size": 1}, "face_size is 1; a face must be at least 2 pixels"),
     ],
 )
 def test_invalid_options_are_refused(options: dict, message: str):
@@ -110,7 +108,7 @@ def test_config_passes_options_on_and_scales_lengths():
     expected = {"projection": "ray", "blending": "hybrid", "core_size": 8, "low_pass_kind": "angular"}
     assert config.options(2.0) == RenderOptions(near=1.0, **expected)
     assert replace(config, near_unit="world").options(2.0) == RenderOptions(near=0.5, **expected)
-    cubemap = {"projection": "pinhole", "cubemap": True, "face_size": 64}
+    cubemap = {"projection": "pinhole", "cubemap": True}
     assert RenderConfig(near=0.0, **cubemap).options(1.0) == RenderOptions(**cubemap)
 
 

@@ -22,7 +22,7 @@ from support.render_cases import (
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.geometry.panorama import rays
-from padgs.render import Rendering, RenderOptions, render
+from padgs.render import Rendering, RenderOptions, cubemap, render
 from padgs.render.cubemap import FACES, FINENESS, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
 
@@ -59,14 +59,14 @@ def test_faces_are_rotations_along_all_axes():
     assert torch.equal(FACES[:, 2].unique(dim=0), torch.cat((torch.eye(3), -torch.eye(3))).double().unique(dim=0))
     assert face_camera(Panorama(1024, 512)).focal == pytest.approx(2 * 1024 / (2 * math.pi))
     assert face_camera(Panorama(100, 100)).focal == pytest.approx(2 * 100 / math.pi)
-    assert face_camera(Panorama(1024, 512), 500).fx == 250
 
 
-@pytest.mark.parametrize("face_size", [None, 2, 5, 64])
+@pytest.mark.parametrize("fineness", [0.1, 1, 2])
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_every_pixel_is_interpolated_inside_one_face(width: int, height: int, face_size: int | None):
+def test_every_pixel_is_interpolated_inside_one_face(monkeypatch, width: int, height: int, fineness: float):
+    monkeypatch.setattr(cubemap, "FINENESS", fineness)
     panorama = Panorama(width, height)
-    lens = face_camera(panorama, face_size)
+    lens = face_camera(panorama)
     assert lens.width / 2 / lens.fx >= 1 + 1 / lens.fx  # 90 degrees and a pixel at each border
     pixels, weights = _corners(panorama, lens, torch.device("cpu"))
     assert (weights >= 0).all() and torch.allclose(weights.sum(-1), weights.new_ones(len(weights)))
@@ -80,14 +80,15 @@ def test_every_pixel_is_interpolated_inside_one_face(width: int, height: int, fa
     ("projection", "kind"), [("pinhole", "pixels"), ("pinhole", "solid"), ("tangent", "angular"), ("ray", "solid")]
 )
 @each_engine
-def test_low_pass_does_not_depend_on_face_size(projection, kind, backend, dtype):
+def test_low_pass_does_not_depend_on_the_pixels_of_faces(monkeypatch, projection, kind, backend, dtype):
     """The low-pass has the size of pixels of the panorama; finer faces do not change it."""
     options = RenderOptions(projection=projection, cubemap=True, low_pass_kind=kind, low_pass=4.0)
     gaussian = replace(broad("middle of a face", 3.0), means=torch.tensor([[0.02, 0.01, 2.0]]).double())
-    coarse, fine = (
-        draw(gaussian, 128, 64, backend=backend, dtype=dtype, options=replace(options, face_size=size)).image
-        for size in (82, 328)
-    )
+    images = []
+    for fineness in (2, 8):
+        monkeypatch.setattr(cubemap, "FINENESS", fineness)
+        images.append(draw(gaussian, 128, 64, backend=backend, dtype=dtype, options=options).image)
+    coarse, fine = images
     assert fine.max() > 0.02
     assert (coarse - fine).abs().max() < 0.06 * fine.max() + 1 / 255
 
@@ -166,7 +167,7 @@ def test_native_faces_match_the_definition(projection: str, generator):
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @needs_native
-def test_native_faces_are_complete_and_efficient(projection: str, generator):
+def test_native_faces_are_complete_and_efficient(monkeypatch, projection: str, generator):
     """Gaussians beside a face are the hard case; almost every Gaussian is beside some face."""
     gaussians = mixture(12, generator)
     lens = Pinhole(70, 44, 28.0, 33.0, 11.5, 30.25)  # wide, and its axis far from its middle
@@ -182,9 +183,10 @@ def test_native_faces_are_complete_and_efficient(projection: str, generator):
 
     small = gaussians_of("ordinary", 300, generator)
     small = replace(small, scales=0.15 * small.scales).to(torch.float32)
+    monkeypatch.setattr(cubemap, "FINENESS", 1)
     whole, faces = (
         render(small, View("v", identity_pose(), 512, 256), how).counters["instances"]
-        for how in (options, replace(options, cubemap=True, face_size=163))  # as fine as the horizon
+        for how in (options, replace(options, cubemap=True))
     )
     assert faces < 1.6 * whole  # 1.3, as faces are finer towards their edges; whole faces in vain made it 15
 
@@ -196,9 +198,9 @@ def test_mean_offsets_match_the_panorama(backend: str, dtype: torch.dtype):
     weight = torch.nn.functional.avg_pool2d(weight.movedim(-1, 0), 9, 1, 4).movedim(0, -1)  # smooth, for interpolation
     for place in ("middle of a face", "edge", "corner"):
         signals = []
-        for cubemap in (False, True):
+        for as_cube in (False, True):
             mean_offsets = torch.zeros(1, 2, dtype=dtype, requires_grad=True)
-            options = RenderOptions(projection="ray", cubemap=cubemap)
+            options = RenderOptions(projection="ray", cubemap=as_cube)
             rendering = draw(
                 broad(place), 128, 64, backend=backend, dtype=dtype, options=options, mean_offsets=mean_offsets
             )

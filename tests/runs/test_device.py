@@ -77,11 +77,9 @@ def test_without_a_library_for_it_a_gpu_is_left_alone_and_that_is_said(monkeypat
 def test_an_unknown_place_is_refused():
     with pytest.raises(ValueError, match="unknown device 'gpu'; known: auto, cpu, cuda"):
         RunOptions(device="gpu")
-    with pytest.raises(ValueError, match="unknown images_on 'gpu'; known: device, cpu"):
-        RunOptions(images_on="gpu")
 
 
-def test_panoramas_are_kept_where_the_run_trains_or_in_main_memory(monkeypatch, root):
+def test_panoramas_are_kept_where_the_run_trains(monkeypatch, root):
     monkeypatch.setenv("PADGS_ROOT", str(root))
     places = []
 
@@ -90,6 +88,5 @@ def test_panoramas_are_kept_where_the_run_trains_or_in_main_memory(monkeypatch, 
         return tiny_scene()
 
     monkeypatch.setattr(pipeline.data, "load", load)
-    for setting in ("run.images_on=device", "run.images_on=cpu"):
-        load_scene(composed(setting), torch.device("meta"))
-    assert places == ["meta", "cpu"]
+    load_scene(composed(), torch.device("meta"))
+    assert places == ["meta"]

@@ -28,7 +28,6 @@ def test_it_reads_like_what_it_is():
         "run.folder=elsewhere",
         "data.path=/mnt/x",
         "data.cache_bytes=1",
-        "run.images_on=cpu",
         "render.max_instances=1000",
         "protocol=paper",
         "seed=0",

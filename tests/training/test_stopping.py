@@ -86,11 +86,11 @@ def test_validation_views_are_trained_on_during_the_fade(scene, monkeypatch):
 def test_they_come_back_within_the_epoch_that_runs(scene, seed):
     apart = validation_split(scene.train)
     order = TrainingViews(scene, seed=seed, held_out=apart)
-    drawn = [order.next_index()]
+    drawn = [order.next(1.0)[0]]
     order.include_held_out()
-    drawn += [order.next_index() for _ in range(2)]
+    drawn += [order.next(1.0)[0] for _ in range(2)]
     order.include_held_out()
-    drawn += [order.next_index() for _ in range(3)]
+    drawn += [order.next(1.0)[0] for _ in range(3)]
     assert drawn[0] not in apart and sorted(drawn) == list(range(6))
 
 

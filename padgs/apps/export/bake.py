@@ -25,7 +25,6 @@ from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.loop import Trainer
-from padgs.training.model import TrainingRender
 from padgs.training.options import Budget, TrainOptions
 
 DEGREE = 3
@@ -131,21 +130,6 @@ def axes_of(covariances: Tensor) -> tuple[Tensor, Tensor]:
     return scales.to(covariances), quats.to(covariances)
 
 
-class FixedCountSplats(SplatModel):
-    """Splats without densification and pruning, with all harmonics active."""
-
-    def __init__(self, splats: Splats, config: RenderConfig, extent: float, iterations: int) -> None:
-        """Use the learning rates of 3DGS for a run of `iterations`."""
-        super().__init__(splats, DensificationOptions(), config, extent=extent, iterations=iterations)
-
-    def observe(self, drawing: TrainingRender, iteration: int) -> None:
-        """Record nothing."""
-
-    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Change nothing."""
-        return ()
-
-
 def distill(
     splats: Splats,
     render_teacher: Callable[[View], Rendering],
@@ -164,6 +148,7 @@ def distill(
         return replace(view, load_pixels=pixels, load_mask=None)
 
     targets = tuple(map(target, scene.train))
-    student = FixedCountSplats(splats, config, ExtentOptions().extent_of(scene), steps)
+    fixed = DensificationOptions(densify_until=0)
+    student = SplatModel(splats, fixed, config, extent=ExtentOptions().extent_of(scene), iterations=steps)
     for record in Trainer(student, replace(scene, train=targets), Budget(steps), DISTILLATION).records():
         progress(record.iteration)

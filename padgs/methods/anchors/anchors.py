@@ -232,8 +232,6 @@ def occupied(cells: Tensor, by: Tensor) -> Tensor:
 
 def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
     """Return anchor positions [A, 3] float32: the distinct grid vertices nearest to points [P, 3], world units."""
-    if not (voxel_size > 0 and math.isfinite(voxel_size)):
-        raise ValueError(f"voxel_size is {voxel_size}; it must be a length > 0 in world units, or auto")
     refuse_unusable(points, "anchors")
     cells, _ = unique_cells(cells_from_points(points, voxel_size))
     return points_from_cells(cells, voxel_size)

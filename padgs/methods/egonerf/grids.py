@@ -74,10 +74,6 @@ def exponential_nodes(first: float, last: float, count: int) -> Tensor:
     >>> exponential_nodes(1.0, 4.0, 4).tolist()
     [0.0, 1.0, 2.0, 4.0]
     """
-    if count < 3:
-        raise ValueError(f"{count} radial nodes are too few; there must be at least 3")
-    if not 0 < first < last:
-        raise ValueError(f"the first radius is {first} and the last {last}; they must be 0 < first < last")
     steps = torch.arange(count - 1, dtype=torch.float64)
     nodes = first * (last / first) ** (steps / (count - 2))
     intervals = torch.cat((nodes[:1], nodes.diff())).clamp(min=first)

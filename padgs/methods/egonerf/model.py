@@ -32,11 +32,6 @@ class EgoNeRFModel:
         """Wrap a radiance field for a run of `iterations`."""
         self.field, self._options, self._iterations = field, field.options, iterations
 
-    @property
-    def rays_at_once(self) -> int:
-        """Rays in one pass."""
-        return self.field.options.rays_at_once
-
     def groups(self) -> list[ParameterGroup]:
         """Return all parameters with their learning rates."""
         field = self.field
@@ -130,7 +125,7 @@ class RayTrainer(Trainer):
             rays = self._pixels.draw(self._rays)
         value, read = rays.weight.new_zeros((), dtype=torch.float64), 0.0
         total = 3 * rays.weight.sum()
-        for part in torch.arange(self._rays, device=total.device).split(model.rays_at_once):
+        for part in torch.arange(self._rays, device=total.device).split(model.field.options.rays_at_once):
             with self._stage("draw"):
                 image = model.colors(rays.origins[part], rays.directions[part], generator)
             error = (image - rays.color[part]).square() * rays.weight[part, None]

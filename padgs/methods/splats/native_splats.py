@@ -19,7 +19,6 @@ from padgs.native import LIBRARIES, cpu, cuda
 from padgs.native.abi import SplatArguments, pointer
 
 MAX_COEFFICIENTS = (MAX_DEGREE + 1) ** 2 - 1  # of degrees >= 1, per colour channel
-OFFSET_WIDTHS = (3, 4)  # columns of `mean_offsets`; the fourth asks for absolute gradients
 Call = Callable[..., None]  # calls a library with sizes, centre, tiny and tensors as `SplatArguments` has them
 
 
@@ -79,7 +78,7 @@ class _Splats(torch.autograd.Function):
         means, log_scales, opacity_logits, dc, rest = parameters
         offsets = None if offsets is None else offsets.contiguous()
         width = 0 if offsets is None else offsets.shape[1]
-        _check_tensors(degree, rest.shape[1], width, *parameters, *([] if offsets is None else [offsets]))
+        assert (degree + 1) ** 2 - 1 <= rest.shape[1] <= MAX_COEFFICIENTS, "the library gets bare pointers"
         like = (means, log_scales, opacity_logits, dc, opacity_logits if width > 3 else None)
         outputs = tuple(map(_empty_like, like))
         ctx.call = functools.partial(call, (len(means), degree, rest.shape[1], width), center, tiny)
@@ -95,20 +94,6 @@ class _Splats(torch.autograd.Function):
         gradients = tuple(map(_empty_like, saved[: len(Parameters._fields)]))
         ctx.call(*saved, *contiguous, *gradients)
         return None, None, None, None, *gradients
-
-
-def _check_tensors(degree: int, stored: int, width: int, *tensors: Tensor) -> None:
-    if not (degree + 1) ** 2 - 1 <= stored <= MAX_COEFFICIENTS:
-        raise ValueError(
-            f"sh_rest has {stored} coefficients, but degree {degree} in use takes {(degree + 1) ** 2 - 1} to "
-            f"{MAX_COEFFICIENTS}; lower active_degree"
-        )
-    if width not in (0, *OFFSET_WIDTHS):
-        raise ValueError(f"mean_offsets has {width} columns; it must have {' or '.join(map(str, OFFSET_WIDTHS))}")
-    if len({(tensor.dtype, tensor.device) for tensor in tensors}) > 1:
-        names = zip(Parameters._fields, tensors, strict=False)
-        kinds = ", ".join(f"{name} {tensor.dtype} on {tensor.device}" for name, tensor in names)
-        raise ValueError(f"all parameters must have one dtype and device, not {kinds}; convert them with .to()")
 
 
 def _empty_like(tensor: Tensor | None) -> Tensor | None:

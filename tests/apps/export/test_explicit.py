@@ -17,12 +17,12 @@ from padgs.apps.export.explicit import export_run, harmonics_rotation, transform
 from padgs.apps.export.splat_file import read_splats
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
-from padgs.evaluation.protocols import protocol_from_options
+from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
 from padgs.render import RenderOptions, render
 from padgs.training.corrections import Similarity
 
-RULES = protocol_from_options("sphere", lpips="none", metrics=["ws_psnr"])
+RULES = replace(PROTOCOLS["sphere"], lpips="none", metrics=("ws_psnr",))
 
 
 def export(*arguments: str):

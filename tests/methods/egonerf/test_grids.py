@@ -94,13 +94,6 @@ def test_node_fraction_is_monotone_and_clamped():
     assert (places[~inside] == 1).all()
 
 
-def test_invalid_radii_are_refused():
-    with pytest.raises(ValueError, match="the first radius is 2.0 and the last 1.0"):
-        exponential_nodes(2.0, 1.0, 10)
-    with pytest.raises(ValueError, match="2 radial nodes are too few"):
-        exponential_nodes(1.0, 2.0, 2)
-
-
 SHAPE = {"radius": 6, "polar": 4, "azimuth": 8}
 
 

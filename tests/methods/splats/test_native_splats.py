@@ -33,24 +33,6 @@ def test_initially_black_colours_get_gradients(monkeypatch, generator, call):
     assert black.sh_dc.grad is not None and (black.sh_dc.grad > 0.28).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rest": torch.zeros(2, 3, 3)}, "sh_rest has 3 coefficients, but degree 2 in use takes 8 to 15"),
-        ({"rest": torch.zeros(2, 24, 3)}, "sh_rest has 24 coefficients"),
-        ({"mean_offsets": torch.zeros(2, 5)}, "mean_offsets has 5 columns; it must have 3 or 4"),
-        ({"dc": torch.zeros(2, 3, dtype=torch.float64)}, "dc torch.float64 on cpu"),
-    ],
-)
-def test_invalid_tensors_are_refused(change, message):
-    two = {"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "opacity_logits": torch.zeros(2)}
-    learned = native_splats.Parameters(
-        **two | {"dc": torch.zeros(2, 3), "rest": torch.zeros(2, 8, 3), "mean_offsets": None} | change
-    )
-    with pytest.raises(ValueError, match=message):
-        native_splats.native_splats(learned, 2, torch.zeros(3), 1e-6)
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 80.0, -80.0, 200.0, -200.0, 0.0])
 @pytest.mark.parametrize("count", [1, 16, 40])
 def test_extreme_parameters_match_the_definition(generator, value, count):
