@@ -35,19 +35,7 @@ from padgs.evaluation.images import to_uint8
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.methods.splats.importance import importance_scores
 from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, Result, Scores
-from padgs.runs.candidates import (
-    PERCEPTION,
-    QUALITY,
-    Candidate,
-    band_shares,
-    knee,
-    loss,
-    next_count,
-    objections,
-    smallest,
-    smallest_by_test,
-    smallest_possible,
-)
+from padgs.runs import candidates
 from padgs.runs.config import BudgetOptions, RunConfig
 from padgs.runs.console import MISSING, number, say
 from padgs.runs.interrupt import Interrupt
@@ -78,9 +66,9 @@ class Search:
         self._console = console
         self._load = partial(load_run, data_path=run.config.data.path, device=run.config.run.device)
         self.folds = [[run.scene.train[index] for index in fold] for fold in validation_folds(run.scene.train)]
-        self.shares = {view.name: band_shares(view) for fold in self.folds for view in fold}
+        self.shares = {view.name: candidates.band_shares(view) for fold in self.folds for view in fold}
         self.row, self.rows = next(iter(run.method.model.counts().items()))
-        self.candidates: list[Candidate] = []
+        self.candidates: list[candidates.Candidate] = []
 
     def complete(self) -> None:
         """Train and measure all candidates; a new search resumes one that was interrupted."""
@@ -92,16 +80,16 @@ class Search:
                 say(
                     self._console,
                     f"{len(self.candidates):3d} {one.rows:8d} {self.row}, {one.blended} Gaussians blended, "
-                    f"{loss(self.candidates, one):5.2f} dB lost, {one.seconds:.1f} s",
+                    f"{candidates.loss(self.candidates, one):5.2f} dB lost, {one.seconds:.1f} s",
                 )
-                count = next_count(self.candidates, SMALLEST_LOSSES, self.shares)
+                count = candidates.next_count(self.candidates, SMALLEST_LOSSES, self.shares)
 
-    def _candidate(self, count: int, stop_requested: Callable[[], bool]) -> Candidate:
+    def _candidate(self, count: int, stop_requested: Callable[[], bool]) -> candidates.Candidate:
         """Return a candidate of `count` rows, with the validation views of all folds."""
         parts = [self._of_fold(count, fold, stop_requested) for fold in range(len(self.folds))]
         views = {name: metrics for part in parts for name, metrics in part["scores"]["views"].items()}
         test = [part["test_ws_psnr"] for part in parts]
-        return Candidate(
+        return candidates.Candidate(
             **parts[0]
             | {
                 "scores": Scores({}, mean_metrics([*views.values()]), views),
@@ -118,7 +106,7 @@ class Search:
         if not result.smallest:
             loaded = self._load(folder / result.run)
             measured = self._measured(loaded, self.folds[fold])
-            measured["test_ws_psnr"] = result.scores[RULES.name].metrics[QUALITY] if result.scores else None
+            measured["test_ws_psnr"] = result.scores[RULES.name].metrics[candidates.QUALITY] if result.scores else None
             measured["seconds"], measured["cpu_seconds"] = lap.seconds()
             with loaded.files:
                 result = loaded.files.finish(replace(result, smallest=measured))
@@ -143,7 +131,7 @@ class Search:
         Returns the result of RUN, with what was found in `smallest`.
         """
         self.complete()
-        count = smallest(self.candidates, epsilon, self.shares).rows
+        count = candidates.smallest(self.candidates, epsilon, self.shares).rows
         config = self._config(count, str(self.run.folder.resolve().parent), None)
         variant = ", ".join(filter(None, (self.run.config.variant, f"smallest {epsilon:g} dB")))
         labels = Labels(config.labels.preset, (EXPERIMENT,))
@@ -165,14 +153,16 @@ class Search:
             None; steps: all candidates, the control first, each with its loss against the control and the objections
             at each epsilon; validation: names of views; seconds, cpu_seconds: of all candidates.
         """
-        found, bend, test = self.candidates, knee(self.candidates), self.run.scene.test
-        by_test = {epsilon: smallest_by_test(found, epsilon) for epsilon in SMALLEST_LOSSES}
+        found, bend, test = self.candidates, candidates.knee(self.candidates), self.run.scene.test
+        by_test = {epsilon: candidates.smallest_by_test(found, epsilon) for epsilon in SMALLEST_LOSSES}
         return {
             "row": self.row,
             "rows": self.rows,
-            "test_ws_psnr": evaluate(self.run.method.render, test, TEST_RULES).metrics[QUALITY] if test else None,
-            "minimal": {f"{e:g}": found.index(smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
-            "possible": {f"{e:g}": found.index(smallest_possible(found, e)) for e in SMALLEST_LOSSES},
+            "test_ws_psnr": evaluate(self.run.method.render, test, TEST_RULES).metrics[candidates.QUALITY]
+            if test
+            else None,
+            "minimal": {f"{e:g}": found.index(candidates.smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
+            "possible": {f"{e:g}": found.index(candidates.smallest_possible(found, e)) for e in SMALLEST_LOSSES},
             "by_test": {f"{e:g}": None if one is None else found.index(one) for e, one in by_test.items()},
             "knee": None if bend is None else found.index(bend),
             "steps": [self._described(one) for one in found],
@@ -181,11 +171,15 @@ class Search:
             "cpu_seconds": math.fsum(one.cpu_seconds for one in found),
         }
 
-    def _described(self, one: Candidate) -> dict[str, Any]:
+    def _described(self, one: candidates.Candidate) -> dict[str, Any]:
         values, metrics, control = asdict(one), one.scores.metrics, self.candidates[0].scores
         del values["scores"]
-        values |= {"loss": loss(self.candidates, one), "ws_psnr": metrics[QUALITY], "lpips": metrics.get(PERCEPTION)}
-        found = {f"{e:g}": list(objections(one.scores, control, e, self.shares)) for e in SMALLEST_LOSSES}
+        values |= {
+            "loss": candidates.loss(self.candidates, one),
+            "ws_psnr": metrics[candidates.QUALITY],
+            "lpips": metrics.get(candidates.PERCEPTION),
+        }
+        found = {f"{e:g}": list(candidates.objections(one.scores, control, e, self.shares)) for e in SMALLEST_LOSSES}
         return values | {"objections": found}
 
     def _config(self, count: int, folder: str, hold_out: int | None) -> RunConfig:
@@ -224,7 +218,7 @@ class Search:
     def _save_picture(self, path: Path) -> None:
         """Save the middle test view: ground truth, the render of RUN, those of the smallest models for two losses."""
         view = self.run.scene.test[len(self.run.scene.test) // 2]
-        runs = (smallest(self.candidates, epsilon, self.shares).run for epsilon in SMALLEST_PICTURED)
+        runs = (candidates.smallest(self.candidates, epsilon, self.shares).run for epsilon in SMALLEST_PICTURED)
         methods = (self.run.method, *(self._load(self.run.folder / FOLDER / run).method for run in runs))
         images = [view.image(), *(method.render(view).image for method in methods)]
         Image.fromarray(np.concatenate([to_uint8(image) for image in images], axis=1)).save(path)

@@ -4,19 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from support.render_cases import (
-    INPUTS,
-    camera_of,
-    each_engine,
-    gaussians_of,
-    joined,
-    leaves,
-    mixture,
-    random_pose,
-    row_error,
-    stable_pixels,
-    view_of,
-)
+from support import render_cases as cases
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
@@ -30,7 +18,7 @@ def picture(
     gaussians: Gaussians, camera: Camera, projection: str, *, backend, dtype, pose=None, weight=None, **options
 ):
     """Return the image, and the gradients of its sum times `weight` [H, W, 3] by every input."""
-    inputs, view = leaves(gaussians, dtype), view_of(camera, pose)
+    inputs, view = cases.leaves(gaussians, dtype), cases.view_of(camera, pose)
     rendering = render(inputs, view, RenderOptions(projection, **options), backend=backend)
     if weight is None:
         return rendering.image
@@ -40,12 +28,12 @@ def picture(
 @pytest.mark.parametrize("size", [(72, 36), (70, 44), (33, 17)])
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
 @each_free
-@each_engine
+@cases.each_engine
 def test_panorama_equals_its_ray_table(size, lens: str, projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(31)
-    gaussians, options = mixture(5, generator), RenderOptions(projection, near=0.02)
-    formula = camera_of(lens, *size)
-    stable = stable_pixels(gaussians, *size, lens=lens, options=options)
+    gaussians, options = cases.mixture(5, generator), RenderOptions(projection, near=0.02)
+    formula = cases.camera_of(lens, *size)
+    stable = cases.stable_pixels(gaussians, *size, lens=lens, options=options)
     assert stable.double().mean() > 0.85
     weight = torch.randn(*stable.shape, 3, generator=generator, dtype=torch.float64) * stable[..., None]
     engine = {"backend": backend, "dtype": dtype, "weight": weight.to(dtype), "near": 0.02}
@@ -54,20 +42,20 @@ def test_panorama_equals_its_ray_table(size, lens: str, projection: str, backend
     actual, gradients = picture(gaussians, table, projection, **engine)
     tolerance = 1e-9 if dtype == torch.float64 else 2e-5
     assert (actual - expected)[stable].abs().max() <= tolerance
-    for name, gradient, truth in zip(INPUTS, gradients, expected_gradients, strict=True):
-        assert row_error(gradient, truth) < (1e-8 if dtype == torch.float64 else 2e-3), name
+    for name, gradient, truth in zip(cases.INPUTS, gradients, expected_gradients, strict=True):
+        assert cases.row_error(gradient, truth) < (1e-8 if dtype == torch.float64 else 2e-3), name
 
 
 @each_free
-@each_engine
+@cases.each_engine
 def test_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype: torch.dtype):
     """The panorama of a rotated camera equals the image of the original camera along the rotated rays."""
     generator = torch.Generator().manual_seed(32)
-    gaussians = mixture(4, generator)
+    gaussians = cases.mixture(4, generator)
     for _ in range(30):
-        pose = random_pose(generator)
+        pose = cases.random_pose(generator)
         panorama = Panorama(70, 35)
-        stable = stable_pixels(gaussians, 70, 35, pose=pose, options=RenderOptions(projection))
+        stable = cases.stable_pixels(gaussians, 70, 35, pose=pose, options=RenderOptions(projection))
         turned = picture(gaussians, panorama, projection, backend=backend, dtype=dtype, pose=pose)
         rays = panorama.rays(dtype=torch.float64) @ pose[:3, :3]  # d_world = R^T d_camera
         table = RayTable(torch.nn.functional.normalize(rays, dim=-1).to(dtype), panorama.focal)
@@ -76,13 +64,13 @@ def test_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype:
         assert (turned - expected)[stable].abs().max() <= limit
 
 
-@each_engine
+@cases.each_engine
 def test_on_the_axis_the_perspective_jacobian_is_the_tangent_plane(backend: str, dtype: torch.dtype):
     """pinhole and tangent agree for means on the optical axis, and differ elsewhere."""
     generator = torch.Generator().manual_seed(34)
     camera = Pinhole(64, 48, 60.0, 60.0, 30.0, 22.0)
     for off_axis in (False, True):
-        gaussians = gaussians_of("ordinary", 1, generator)
+        gaussians = cases.gaussians_of("ordinary", 1, generator)
         means = torch.tensor([[1.2 if off_axis else 0.0, 0.0, 3.0]], dtype=torch.float64)
         quats, scales = gaussians.quats, torch.tensor([[0.5, 0.2, 0.3]], dtype=torch.float64)
         one = Gaussians(means, quats, scales, gaussians.opacities.clamp(min=0.5), gaussians.colors)
@@ -93,13 +81,13 @@ def test_on_the_axis_the_perspective_jacobian_is_the_tangent_plane(backend: str,
         assert (difference > 0.01) if off_axis else (difference < (1e-9 if dtype == torch.float64 else 1e-5))
 
 
-@each_engine
+@cases.each_engine
 def test_tangent_is_the_limit_of_ray_for_small_gaussians(backend: str, dtype: torch.dtype):
     """tangent is the limit of ray; halving the angle halves the difference."""
     differences = []
     for size in (0.08, 0.04, 0.02):
         generator = torch.Generator().manual_seed(35)
-        gaussians = gaussians_of("ordinary", 20, generator)
+        gaussians = cases.gaussians_of("ordinary", 20, generator)
         radius = gaussians.means.norm(dim=-1, keepdim=True)
         shape = size * torch.tensor([1.0, 0.5, 0.8], dtype=torch.float64)
         small = Gaussians(**{**vars(gaussians), "scales": radius * shape, "opacities": gaussians.opacities.clamp(0.5)})
@@ -112,16 +100,16 @@ def test_tangent_is_the_limit_of_ray_for_small_gaussians(backend: str, dtype: to
 
 
 @each_free
-@each_engine
+@cases.each_engine
 def test_the_gradient_of_the_rays_is_that_of_the_pose(projection: str, backend: str, dtype: torch.dtype):
     """Rotating all rays by a small angle is rotating the camera; both derivatives must agree."""
     generator = torch.Generator().manual_seed(36)
-    gaussians = joined(gaussians_of("ordinary", 15, generator), gaussians_of("needle", 5, generator))
-    table = camera_of("fisheye", 60, 40).table.to(dtype).requires_grad_()
-    pose = random_pose(generator).to(dtype).requires_grad_()
+    gaussians = cases.joined(cases.gaussians_of("ordinary", 15, generator), cases.gaussians_of("needle", 5, generator))
+    table = cases.camera_of("fisheye", 60, 40).table.to(dtype).requires_grad_()
+    pose = cases.random_pose(generator).to(dtype).requires_grad_()
     camera = RayTable(table, 25.0)
     weight = torch.randn(40, 60, 3, generator=generator, dtype=torch.float64).to(dtype)
-    rendering = render(gaussians.to(dtype), view_of(camera, pose), RenderOptions(projection), backend=backend)
+    rendering = render(gaussians.to(dtype), cases.view_of(camera, pose), RenderOptions(projection), backend=backend)
     by_table, by_pose = torch.autograd.grad((rendering.image * weight).sum(), (table, pose))
     generators = torch.linalg.cross(torch.eye(3)[:, None].expand(3, 3, 3), torch.eye(3).expand(3, 3, 3)).to(dtype)
     for axis in range(3):

@@ -6,16 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.render_cases import (
-    INPUTS,
-    camera_of,
-    each_engine,
-    each_setup,
-    gaussians_of,
-    identity_pose,
-    needs_native,
-    view_of,
-)
+from support import render_cases as cases
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole, RayTable
@@ -23,16 +14,16 @@ from padgs.native import cpu
 from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import View
 
-VIEW = View("v", identity_pose(), 32, 16)
+VIEW = View("v", cases.identity_pose(), 32, 16)
 SQUARE = {"wrap": False, "bounds": "square"}
 
 
 @pytest.fixture
 def gaussians(generator: torch.Generator) -> Gaussians:
-    return gaussians_of("ordinary", 5, generator).to(torch.float32)
+    return cases.gaussians_of("ordinary", 5, generator).to(torch.float32)
 
 
-@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("name", cases.INPUTS)
 def test_wrong_shapes_are_named(name: str, gaussians: Gaussians):
     for wrong in (getattr(gaussians, name)[:4], getattr(gaussians, name)[..., None], torch.zeros(())):
         if name == "means" and wrong.shape == (4, 3):
@@ -43,13 +34,13 @@ def test_wrong_shapes_are_named(name: str, gaussians: Gaussians):
             render(replace(gaussians, **{name: wrong}), VIEW)
 
 
-@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("name", cases.INPUTS)
 def test_mixed_dtypes_and_devices_are_named(name: str, gaussians: Gaussians):
     other = getattr(gaussians, name)
     with pytest.raises(ValueError, match=rf"{'quats' if name == 'means' else name} has dtype torch.float.*convert"):
         render(replace(gaussians, **{name: other.double()}), VIEW)
     with pytest.raises(ValueError, match=rf"{'quats' if name == 'means' else name} is on .*; move one of them"):
-        render(replace(gaussians, **{name: other.to("meta")}), VIEW.at(identity_pose()))
+        render(replace(gaussians, **{name: other.to("meta")}), VIEW.at(cases.identity_pose()))
 
 
 def test_unusable_dtypes_are_named(gaussians: Gaussians):
@@ -72,7 +63,7 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
         with pytest.raises(ValueError, match=f"absgrad {message}"):
             render(gaussians, VIEW, RenderOptions(projection), absgrad=torch.zeros(count))
     with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\)"):
-        render(gaussians, VIEW.at(identity_pose()[:3]))
+        render(gaussians, VIEW.at(cases.identity_pose()[:3]))
 
 
 @pytest.mark.parametrize(
@@ -136,24 +127,26 @@ def test_unknown_names_list_the_known_ones(gaussians: Gaussians):
 )
 def test_unsupported_cameras_are_refused(projection, lens, more, message, gaussians: Gaussians):
     with pytest.raises(ValueError, match=message):
-        render(gaussians, view_of(camera_of(lens, 32, 16)), RenderOptions(projection, **more))
+        render(gaussians, cases.view_of(cases.camera_of(lens, 32, 16)), RenderOptions(projection, **more))
 
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
-@each_engine
+@cases.each_engine
 def test_a_bad_ray_spoils_its_own_pixel_only(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    options, camera = RenderOptions(projection), camera_of("fisheye", 32, 16)
-    expected = render(gaussians.to(dtype), view_of(camera), options, backend=backend).image
+    options, camera = RenderOptions(projection), cases.camera_of("fisheye", 32, 16)
+    expected = render(gaussians.to(dtype), cases.view_of(camera), options, backend=backend).image
     others = torch.ones(16, 32, dtype=torch.bool)
     others[3, 4] = False
     for value in (0.0, 2.0, float("nan"), float("inf")):
         table = camera.table.clone()
         table[3, 4] = table[3, 4] * value
-        image = render(gaussians.to(dtype), view_of(RayTable(table, camera.focal)), options, backend=backend).image
+        image = render(
+            gaussians.to(dtype), cases.view_of(RayTable(table, camera.focal)), options, backend=backend
+        ).image
         torch.testing.assert_close(image[others], expected[others])
 
 
-PINHOLE, TABLE = Pinhole(32, 16, 10, 10, 16, 8), camera_of("fisheye", 32, 16).table
+PINHOLE, TABLE = Pinhole(32, 16, 10, 10, 16, 8), cases.camera_of("fisheye", 32, 16).table
 
 
 @pytest.mark.parametrize(
@@ -183,19 +176,19 @@ PINHOLE, TABLE = Pinhole(32, 16, 10, 10, 16, 8), camera_of("fisheye", 32, 16).ta
 def test_impossible_cameras_are_refused(camera, message: str, gaussians: Gaussians):
     for projection in ("tangent", "ray", *(["pinhole"] if isinstance(camera, Pinhole) else [])):
         with pytest.raises(ValueError, match=message):
-            render(gaussians, View("v", identity_pose(), 32, 16, lens=camera), RenderOptions(projection))
+            render(gaussians, View("v", cases.identity_pose(), 32, 16, lens=camera), RenderOptions(projection))
 
 
 @pytest.mark.parametrize("table_dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
-@each_engine
+@cases.each_engine
 def test_ray_tables_may_have_any_dtype(projection, table_dtype, backend, dtype, gaussians: Gaussians):
-    camera, weight = camera_of("fisheye", 33, 16), torch.rand(16, 33, 3, dtype=dtype)
+    camera, weight = cases.camera_of("fisheye", 33, 16), torch.rand(16, 33, 3, dtype=dtype)
     results = []
     for table in (camera.table.to(dtype), camera.table.to(table_dtype)):
         # A strided table is as good as any.
         table = torch.stack((table, -table), dim=-1)[..., 0].requires_grad_()
-        view = view_of(RayTable(table, camera.focal))
+        view = cases.view_of(RayTable(table, camera.focal))
         image = render(gaussians.to(dtype), view, RenderOptions(projection), backend=backend).image
         results.append((image, torch.autograd.grad((image * weight).sum(), table)[0]))
     assert torch.equal(results[0][0], results[1][0]) and results[0][0].any()
@@ -203,22 +196,22 @@ def test_ray_tables_may_have_any_dtype(projection, table_dtype, backend, dtype, 
     torch.testing.assert_close(results[1][1].to(dtype), results[0][1], rtol=1e-6, atol=1e-6)
 
 
-@needs_native
+@cases.needs_native
 def test_the_cpu_backend_refuses_float64(gaussians: Gaussians):
     with pytest.raises(ValueError, match="backend cpu takes float32 .* got torch.float64 .*use backend=torch"):
         render(gaussians.to(torch.float64), VIEW, backend="cpu")
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_without_gaussians_the_image_is_the_background(projection, lens, blending, backend, dtype):
     nothing = Gaussians(
         *(torch.zeros(0, *shape, dtype=dtype, requires_grad=True) for shape in ((3,), (4,), (3,), (), (3,)))
     )
     background = torch.tensor([0.25, 0.5, 0.75], dtype=dtype, requires_grad=True)
     extra = {"background": background, "mean_offsets": torch.zeros(0, 2, dtype=dtype), "backend": backend}
-    view = view_of(camera_of(lens, 32, 16))
+    view = cases.view_of(cases.camera_of(lens, 32, 16))
     rendering = render(nothing, view, RenderOptions(projection, blending=blending), **extra)
     assert torch.equal(rendering.image, background.expand(16, 32, 3))
     assert torch.equal(rendering.transmittance, torch.ones(16, 32, dtype=dtype))
@@ -228,10 +221,10 @@ def test_without_gaussians_the_image_is_the_background(projection, lens, blendin
     assert background.grad.tolist() == [512.0] * 3
 
 
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_tensors_need_not_be_contiguous(projection, lens, backend, dtype, gaussians: Gaussians):
-    view, options = view_of(camera_of(lens, 32, 16)), RenderOptions(projection)
+    view, options = cases.view_of(cases.camera_of(lens, 32, 16)), RenderOptions(projection)
     reference = render(gaussians.to(dtype), view, options, backend=backend).image
     strided = {}
     for name, tensor in vars(gaussians.to(dtype)).items():

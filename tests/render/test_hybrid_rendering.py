@@ -8,20 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 from support import render_cases
+from support import render_cases as cases
 from support.definition import one_pixel
-from support.render_cases import (
-    INPUTS,
-    assert_matches_definition,
-    differentiated,
-    each_engine,
-    each_native_engine,
-    gaussians_of,
-    identity_pose,
-    mixture,
-    projected,
-    random_pose,
-    row_error,
-)
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
@@ -49,7 +37,7 @@ def options_of(projection: str, size: int, **more) -> RenderOptions:
 
 def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> tuple[Tensor, ...]:
     """Return alpha and distance [P, N], radial depths [N], and which pixels [P] are far from any decision."""
-    footprints = projected(gaussians, pose, camera, options)
+    footprints = cases.projected(gaussians, pose, camera, options)
     everything, pixels = torch.arange(len(gaussians)), torch.arange(camera.height * camera.width)
     rows, columns = pixels // camera.width, pixels % camera.width
     q, inside = footprints.squared_distance(everything, rows, columns)
@@ -79,11 +67,15 @@ def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose
 
 @pytest.mark.parametrize("size", [1, 4, 16])
 @each_projection
-@each_engine
+@cases.each_engine
 def test_images_match_the_published_procedure(projection: str, size: int, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(100 * PROJECTIONS.index(projection) + size)
-    camera, options, pose = camera_of(projection, 33, 17), options_of(projection, size), random_pose(generator, 0.2)
-    gaussians = mixture(6, generator)
+    camera, options, pose = (
+        camera_of(projection, 33, 17),
+        options_of(projection, size),
+        cases.random_pose(generator, 0.2),
+    )
+    gaussians = cases.mixture(6, generator)
     alpha, distance, radius, stable = fragments(gaussians, camera, options, pose)
     assert stable.double().mean() > 0.8
     view = View("v", pose, 33, 17, lens=camera)
@@ -106,13 +98,15 @@ def test_images_match_the_published_procedure(projection: str, size: int, backen
 
 
 def assert_native_matches(gaussians: Gaussians, camera: Camera, options: RenderOptions, generator, backend: str):
-    *_, stable = fragments(gaussians, camera, options, identity_pose())
+    *_, stable = fragments(gaussians, camera, options, cases.identity_pose())
     stable = stable.view(camera.height, camera.width)
     assert stable.double().mean() > 0.6
-    assert_matches_definition(gaussians, camera, options, stable, generator, backend=backend, depth_tolerance=1e-4)
+    cases.assert_matches_definition(
+        gaussians, camera, options, stable, generator, backend=backend, depth_tolerance=1e-4
+    )
 
 
-@each_native_engine
+@cases.each_native_engine
 @pytest.mark.parametrize("size", [1, 5, 16, 256])
 @pytest.mark.parametrize(
     ("projection", "kind"),
@@ -123,7 +117,7 @@ def assert_native_matches(gaussians: Gaussians, camera: Camera, options: RenderO
 )
 def test_native_matches_the_definition(projection: str, kind: str, size: int, backend: str):
     generator = torch.Generator().manual_seed(7 + size)
-    gaussians = gaussians_of("huge" if kind == "broad" else kind, 25, generator)
+    gaussians = cases.gaussians_of("huge" if kind == "broad" else kind, 25, generator)
     gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
     if kind == "broad":  # but with the camera outside, and seen through
         gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
@@ -132,18 +126,18 @@ def test_native_matches_the_definition(projection: str, kind: str, size: int, ba
         assert_native_matches(gaussians, camera, options_of(projection, size), generator, backend)
 
 
-@each_native_engine
+@cases.each_native_engine
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @pytest.mark.parametrize("case", ["table", "pinhole", "fisheye", "wide tiles"])
 def test_native_matches_the_definition_for_other_cameras(projection: str, case: str, backend: str, generator):
     if case == "table":
         formula = Panorama(45, 23)
         camera = RayTable(formula.rays(dtype=torch.float64), formula.focal)
-        gaussians = mixture(6, generator, ("ordinary", "polar", "seam"))
+        gaussians = cases.mixture(6, generator, ("ordinary", "polar", "seam"))
     elif case == "wide tiles":  # tiles near the poles of 330 columns are wider than a chunk
-        camera, gaussians = Panorama(330, 165), mixture(8, generator, ("polar", "pole", "seam"))
+        camera, gaussians = Panorama(330, 165), cases.mixture(8, generator, ("polar", "pole", "seam"))
     else:
-        camera, gaussians = render_cases.camera_of(case, 72, 36), gaussians_of("ordinary", 60, generator)
+        camera, gaussians = render_cases.camera_of(case, 72, 36), cases.gaussians_of("ordinary", 60, generator)
     assert_native_matches(gaussians, camera, options_of(projection, 3), generator, backend)
 
 
@@ -154,7 +148,7 @@ def overlapping(count: int, generator: torch.Generator) -> Gaussians:
         return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
     return replace(
-        gaussians_of("ordinary", count, generator),
+        cases.gaussians_of("ordinary", count, generator),
         means=direction(uniform(-0.3, 0.3, count), uniform(-0.2, 0.2, count)) * uniform(2, 2.2, count, 1),
         scales=uniform(0.2, 0.56, count, 3),
         opacities=uniform(0.3, 0.6, count),
@@ -162,12 +156,12 @@ def overlapping(count: int, generator: torch.Generator) -> Gaussians:
 
 
 @each_projection
-@each_engine
+@cases.each_engine
 def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(11)
     camera, options = camera_of(projection, 128, 64), options_of(projection, 64)
     gaussians = overlapping(10, generator).to(torch.float32).to(torch.float64)
-    alpha, distance, radius, stable = fragments(gaussians, camera, options, identity_pose())
+    alpha, distance, radius, stable = fragments(gaussians, camera, options, cases.identity_pose())
     drawn, faint = alpha > 0, (alpha > 0) & (alpha < 0.05)
     furthest = torch.where(drawn, distance, -1.0).argmax(-1, keepdim=True)
     stable &= drawn.any(-1)
@@ -178,7 +172,7 @@ def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str
     in_order = alpha.gather(1, order)
     left = torch.cumprod(torch.cat((torch.ones(len(alpha), 1), 1 - in_order), dim=-1), dim=-1)
     expected = torch.einsum("pk,pkc->pc", in_order * left[:, :-1], gaussians.colors[order])
-    view = View("v", identity_pose(), 128, 64, lens=camera)
+    view = View("v", cases.identity_pose(), 128, 64, lens=camera)
     rendering = render(gaussians.to(dtype), view, options, backend=backend)
     assert (rendering.image.view(-1, 3) - expected)[stable].abs().max() < 2e-5
     assert (rendering.transmittance.view(-1) - left[:, -1])[stable].abs().max() < 2e-5
@@ -194,7 +188,7 @@ def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str
         torch.testing.assert_close(getattr(rendering, name)[agree], getattr(classic, name)[agree], rtol=1e-4, atol=1e-5)
 
 
-@each_engine
+@cases.each_engine
 def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
     """Two long Gaussians cross ahead, turned by 45 degrees to either side: each is in front on one side."""
     half_turn = math.pi / 8
@@ -205,7 +199,7 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
         opacities=torch.tensor([0.9, 0.9]),
         colors=torch.eye(3)[:2],
     ).to(dtype)
-    view = View("v", identity_pose(), 64, 9, lens=Pinhole(64, 9, 80.0, 80.0, 32.0, 4.5))
+    view = View("v", cases.identity_pose(), 64, 9, lens=Pinhole(64, 9, 80.0, 80.0, 32.0, 4.5))
     hybrid, classic = (
         render(gaussians, view, RenderOptions(projection="ray", blending=blending), backend=backend).image[4]
         for blending in ("hybrid", "sorted")
@@ -216,20 +210,20 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
 
 
 @each_projection
-@each_engine
+@cases.each_engine
 def test_input_order_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(12)
-    gaussians, camera, options = mixture(8, generator), camera_of(projection, 48, 24), options_of(projection, 3)
-    *_, stable = fragments(gaussians, camera, options, identity_pose())
+    gaussians, camera, options = cases.mixture(8, generator), camera_of(projection, 48, 24), options_of(projection, 3)
+    *_, stable = fragments(gaussians, camera, options, cases.identity_pose())
     weights = torch.randn(24, 48, 5, generator=generator, dtype=torch.float64) * stable.view(24, 48, 1)
     order = torch.randperm(len(gaussians), generator=generator)
-    permuted = Gaussians(**{name: getattr(gaussians, name)[order] for name in INPUTS})
-    first, gradients = differentiated(gaussians, camera, options, weights, backend=backend, dtype=dtype)
-    second, found = differentiated(permuted, camera, options, weights, backend=backend, dtype=dtype)
+    permuted = Gaussians(**{name: getattr(gaussians, name)[order] for name in cases.INPUTS})
+    first, gradients = cases.differentiated(gaussians, camera, options, weights, backend=backend, dtype=dtype)
+    second, found = cases.differentiated(permuted, camera, options, weights, backend=backend, dtype=dtype)
     assert first.counters == second.counters
     torch.testing.assert_close(second.image, first.image, rtol=0, atol=1e-6)
-    for name in INPUTS:
-        assert row_error(found[name], gradients[name][order]) < 1e-4, name
+    for name in cases.INPUTS:
+        assert cases.row_error(found[name], gradients[name][order]) < 1e-4, name
 
 
 def random_fragments(pixels: int, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -6,21 +6,7 @@ import math
 
 import pytest
 import torch
-from support.render_cases import (
-    KINDS,
-    blended,
-    chosen,
-    draw,
-    each_engine,
-    each_panorama,
-    each_setup,
-    gaussians_of,
-    identity_pose,
-    joined,
-    mixture,
-    random_pose,
-    stable_pixels,
-)
+from support import render_cases as cases
 
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.render import RenderOptions
@@ -32,39 +18,39 @@ def yaw(angle: float) -> torch.Tensor:
     return torch.tensor([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], dtype=torch.float64)
 
 
-@each_panorama
-@each_engine
+@cases.each_panorama
+@cases.each_engine
 def test_a_yaw_of_the_world_shifts_the_image(projection: str, backend: str, dtype: torch.dtype):
     width, height = 64, 33
-    gaussians = mixture(6, torch.Generator().manual_seed(4), ("ordinary", "polar", "seam", "near"))
+    gaussians = cases.mixture(6, torch.Generator().manual_seed(4), ("ordinary", "polar", "seam", "near"))
     engine = {"backend": backend, "dtype": dtype, "options": RenderOptions(projection)}
-    reference = draw(gaussians, width, height, **engine)
+    reference = cases.draw(gaussians, width, height, **engine)
     for step in range(1, 64):
-        pose = identity_pose()
+        pose = cases.identity_pose()
         pose[:3, :3] = yaw(2 * math.pi * step / 64)
-        turned = draw(gaussians, width, height, pose=pose, **engine)
+        turned = cases.draw(gaussians, width, height, pose=pose, **engine)
         shifted = torch.roll(reference.image, step, dims=1)
         error = (turned.image - shifted).abs().amax(-1)
         assert error.max() <= 1 / 255, step
         assert (error > 2e-5).double().mean() < 1e-3, step  # a pair within rounding of the cut may flip, no more
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@each_setup
-@each_engine
+@pytest.mark.parametrize("kind", cases.KINDS)
+@cases.each_setup
+@cases.each_engine
 def test_the_unit_of_length_does_not_matter(kind: str, projection: str, lens: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(6)
-    gaussians, pose = gaussians_of(kind, 20, generator), random_pose(generator, shift=0.01)
+    gaussians, pose = cases.gaussians_of(kind, 20, generator), cases.random_pose(generator, shift=0.01)
     options, engine = RenderOptions(projection, near=0.003), {"backend": backend, "dtype": dtype, "lens": lens}
-    stable = stable_pixels(gaussians, 50, 30, lens=lens, pose=pose, options=options)
+    stable = cases.stable_pixels(gaussians, 50, 30, lens=lens, pose=pose, options=options)
     assert stable.double().mean() > 0.9
-    reference = draw(gaussians, 50, 30, pose=pose, options=options, **engine)
+    reference = cases.draw(gaussians, 50, 30, pose=pose, options=options, **engine)
     for unit in (1e-3, 0.1, 10, 1e3):
         larger = Gaussians(**{**vars(gaussians), "means": unit * gaussians.means, "scales": unit * gaussians.scales})
         moved = pose.clone()
         moved[:3, 3] *= unit
         scaled_options = RenderOptions(projection, near=unit * options.near)
-        scaled = draw(larger, 50, 30, pose=moved, options=scaled_options, **engine)
+        scaled = cases.draw(larger, 50, 30, pose=moved, options=scaled_options, **engine)
         limit = 1e-4 if kind == "needle" else 2e-5
         assert (scaled.image - reference.image)[stable].abs().max() <= limit
         torch.testing.assert_close(scaled.depth[stable], unit * reference.depth[stable], rtol=1e-4, atol=0)
@@ -73,21 +59,21 @@ def test_the_unit_of_length_does_not_matter(kind: str, projection: str, lens: st
                 assert scaled.counters[counter] == pytest.approx(reference.counters[counter], rel=0.01), counter
 
 
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_rigid_motion_changes_nothing(projection, lens, backend, dtype):
     generator = torch.Generator().manual_seed(7)
-    gaussians, options = mixture(4, generator), RenderOptions(projection)
-    stable = stable_pixels(gaussians, 48, 24, lens=lens, options=options)
+    gaussians, options = cases.mixture(4, generator), RenderOptions(projection)
+    stable = cases.stable_pixels(gaussians, 48, 24, lens=lens, options=options)
     engine = {"backend": backend, "dtype": dtype, "lens": lens, "options": options}
-    reference = draw(gaussians, 48, 24, **engine)
+    reference = cases.draw(gaussians, 48, 24, **engine)
     for _ in range(30 if backend == "cpu" else 5):
-        pose = random_pose(generator, shift=0.0)  # a shift would cost the near Gaussians their digits
+        pose = cases.random_pose(generator, shift=0.0)  # a shift would cost the near Gaussians their digits
         rotation = pose[:3, :3]
         quats = gaussians.quats  # world_from_old = R^T: a rotation of each orientation, as a product of quaternions
         turn = quaternion_of(rotation.T)
         moved = Gaussians(**{**vars(gaussians), "means": gaussians.means @ rotation, "quats": product(turn, quats)})
-        turned = draw(moved, 48, 24, pose=pose, **engine)
+        turned = cases.draw(moved, 48, 24, pose=pose, **engine)
         assert (turned.image - reference.image)[stable].abs().max() <= 1e-4
 
 
@@ -109,23 +95,23 @@ def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.cat((scalar, vector), dim=-1)
 
 
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_input_order_does_not_matter(projection, lens, backend, dtype):
     generator = torch.Generator().manual_seed(10)
-    gaussians = mixture(8, generator)
+    gaussians = cases.mixture(8, generator)
     assert gaussians.means.float().norm(dim=-1).unique().numel() == len(gaussians), "the case has ties"
     engine = {"backend": backend, "dtype": dtype, "lens": lens, "options": RenderOptions(projection)}
-    reference = draw(gaussians, 35, 22, **engine)
+    reference = cases.draw(gaussians, 35, 22, **engine)
     permutation = torch.randperm(len(gaussians), generator=generator)
-    rendering = draw(chosen(gaussians, permutation), 35, 22, **engine)
+    rendering = cases.draw(cases.chosen(gaussians, permutation), 35, 22, **engine)
     assert torch.equal(rendering.image, reference.image)
     assert torch.equal(rendering.visible, reference.visible[permutation])
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_ties_keep_the_input_order(projection, lens, blending, backend, dtype):
     def ball(color: tuple[float, float, float]) -> Gaussians:
         row = ((0.1, 0, 2), (1.0, 0, 0, 0), (0.5, 0.5, 0.5), 0.95, color)
@@ -133,7 +119,9 @@ def test_ties_keep_the_input_order(projection, lens, blending, backend, dtype):
 
     red, blue = ball((1, 0, 0)), ball((0, 0, 1))
     for first, second, channel in ((red, blue, 0), (blue, red, 2)):
-        options = RenderOptions(projection, **blended(blending, 2))
-        image = draw(joined(first, second), 64, 32, lens=lens, backend=backend, dtype=dtype, options=options).image
+        options = RenderOptions(projection, **cases.blended(blending, 2))
+        image = cases.draw(
+            cases.joined(first, second), 64, 32, lens=lens, backend=backend, dtype=dtype, options=options
+        ).image
         row, column = divmod(int(image.sum(-1).argmax()), 64)
         assert image[row, column, channel] > 0.8 and image[row, column, 2 - channel] < 0.15

@@ -4,17 +4,7 @@ import pytest
 import torch
 from scipy.stats import spearmanr
 from support import cuda_engine
-from support.render_cases import (
-    camera_of,
-    chosen,
-    each_setup,
-    gaussians_of,
-    identity_pose,
-    mixture,
-    needs_native,
-    random_pose,
-    view_of,
-)
+from support import render_cases as cases
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
@@ -35,11 +25,11 @@ def mean_square(gaussians: Gaussians, view: View, target: Tensor, weight: Tensor
 def without(gaussians: Gaussians, removed: Tensor) -> Gaussians:
     kept = torch.ones(len(gaussians), dtype=torch.bool)
     kept[removed] = False
-    return chosen(gaussians, kept)
+    return cases.chosen(gaussians, kept)
 
 
 def test_two_gaussians_by_hand():
-    view = view_of(camera_of("panorama", 16, 8))
+    view = cases.view_of(cases.camera_of("panorama", 16, 8))
     ray = rays(16, 8, dtype=torch.float64)[3, 5]
     gaussians = Gaussians(
         means=torch.stack((1.0 * ray, 2.0 * ray)),
@@ -59,14 +49,14 @@ def test_two_gaussians_by_hand():
     assert found.peak.tolist() == pytest.approx([0.5, 0.2], abs=1e-8)
 
 
-@each_setup
-@pytest.mark.parametrize("backend", ["torch", pytest.param("cpu", marks=needs_native)])
+@cases.each_setup
+@pytest.mark.parametrize("backend", ["torch", pytest.param("cpu", marks=cases.needs_native)])
 def test_scores_match_actual_removals(projection, lens, backend):
     generator = torch.Generator().manual_seed(3)
     dtype = torch.float64 if backend == "torch" else torch.float32
-    gaussians = mixture(6, generator, ("ordinary", "huge", "needle")).to(dtype)
-    camera = camera_of(lens, 36, 18)
-    view, options = view_of(camera, random_pose(generator)), RenderOptions(projection=projection)
+    gaussians = cases.mixture(6, generator, ("ordinary", "huge", "needle")).to(dtype)
+    camera = cases.camera_of(lens, 36, 18)
+    view, options = cases.view_of(camera, cases.random_pose(generator)), RenderOptions(projection=projection)
     target = torch.rand(18, 36, 3, generator=generator, dtype=torch.float64).to(dtype)
     weight = torch.rand(18, 36, generator=generator, dtype=torch.float64).to(dtype)
     before = mean_square(gaussians, view, target, weight, options, backend)
@@ -79,10 +69,10 @@ def test_scores_match_actual_removals(projection, lens, backend):
     assert max(map(abs, true)) > 5e-4, "or the test sees nothing"
 
 
-@needs_native
+@cases.needs_native
 def test_targets_have_any_dtype_but_the_size_of_the_view():
     generator = torch.Generator().manual_seed(2)
-    gaussians, view = mixture(3, generator).to(torch.float32), view_of(camera_of("panorama", 16, 8))
+    gaussians, view = cases.mixture(3, generator).to(torch.float32), cases.view_of(cases.camera_of("panorama", 16, 8))
     target, weight = torch.rand(8, 16, 3, generator=generator), torch.ones(8, 16)
     usual = leave_one_out(gaussians, view, target, weight, SHARP, backend="cpu")
     doubled = leave_one_out(gaussians, view, target.double(), weight.double(), SHARP, backend="cpu")
@@ -93,14 +83,14 @@ def test_targets_have_any_dtype_but_the_size_of_the_view():
         leave_one_out(gaussians, view, target[:4], weight[:4], SHARP, backend="cpu")
 
 
-@each_setup
+@cases.each_setup
 @pytest.mark.parametrize(
-    "backend", [pytest.param("cpu", marks=needs_native), pytest.param("cuda", marks=cuda_engine.marks())]
+    "backend", [pytest.param("cpu", marks=cases.needs_native), pytest.param("cuda", marks=cuda_engine.marks())]
 )
 def test_native_agrees_with_the_definition(projection, lens, backend):
     generator = torch.Generator().manual_seed(1)
-    gaussians = mixture(20, generator).to(torch.float32)
-    view = view_of(camera_of(lens, 70, 44), random_pose(generator))
+    gaussians = cases.mixture(20, generator).to(torch.float32)
+    view = cases.view_of(cases.camera_of(lens, 70, 44), cases.random_pose(generator))
     target, weight = torch.rand(44, 70, 3, generator=generator), torch.rand(44, 70, generator=generator)
     options = RenderOptions(projection=projection, near=0.001, max_instances=400)  # in strips, too
     native, defined = (
@@ -112,11 +102,11 @@ def test_native_agrees_with_the_definition(projection, lens, backend):
     assert torch.allclose(native.peak, defined.peak, rtol=1e-2, atol=3e-3)
 
 
-@needs_native
+@cases.needs_native
 def test_rank_correlation_with_actual_removals():
     generator = torch.Generator().manual_seed(0)
-    true = gaussians_of("ordinary", COUNT, generator).to(torch.float32)
-    view, options = view_of(camera_of("panorama", 64, 32)), RenderOptions(projection="ray")
+    true = cases.gaussians_of("ordinary", COUNT, generator).to(torch.float32)
+    view, options = cases.view_of(cases.camera_of("panorama", 64, 32)), RenderOptions(projection="ray")
     target = render(true, view, options).image
     noise = torch.randn(true.means.shape, generator=generator)
     model = Gaussians(true.means + 0.02 * noise, true.quats, true.scales, true.opacities, true.colors + 0.1 * noise)
@@ -137,7 +127,10 @@ def test_rank_correlation_with_actual_removals():
 
 def test_masks_and_other_blendings():
     generator = torch.Generator().manual_seed(2)
-    gaussians, view = gaussians_of("ordinary", 30, generator), view_of(camera_of("panorama", 24, 12), identity_pose())
+    gaussians, view = (
+        cases.gaussians_of("ordinary", 30, generator),
+        cases.view_of(cases.camera_of("panorama", 24, 12), cases.identity_pose()),
+    )
     target = torch.rand(12, 24, 3, generator=generator, dtype=torch.float64)
     weight = torch.ones(12, 24, dtype=torch.float64)
     weight[:, 6:] = 0

@@ -7,17 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.render_cases import (
-    differentiated,
-    identity_pose,
-    leaves,
-    mixture,
-    needs_native,
-    projected,
-    random_pose,
-    row_error,
-    stable_pixels,
-)
+from support import render_cases as cases
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole
@@ -63,7 +53,7 @@ def test_a_point_becomes_a_circle_of_pixels_or_angle(latitude: float):
     camera, point = camera_of("erp"), small(latitude, 1e-9)
     widths = {}
     for kind in ("pixels", "angular"):
-        footprints = projected(point, identity_pose(), camera, options_of("erp", kind))
+        footprints = cases.projected(point, cases.identity_pose(), camera, options_of("erp", kind))
         assert isinstance(footprints, PlanarFootprints)
         a, b, c = footprints.whitening[0].tolist()
         assert abs(b) < 1e-9
@@ -77,7 +67,7 @@ def test_a_point_becomes_a_circle_of_pixels_or_angle(latitude: float):
 def test_a_point_spans_the_same_angle_in_every_projection(projection: str):
     """Along a meridian: q = (gamma f)^2 / low_pass, for small angles gamma."""
     camera, point = camera_of(projection, 512), small(0.0, 1e-9)
-    footprints = projected(point, identity_pose(), camera, options_of(projection, "angular"))
+    footprints = cases.projected(point, cases.identity_pose(), camera, options_of(projection, "angular"))
     row = camera.height // 2 + torch.arange(-2, 2)
     column = torch.full_like(row, int(camera.width * 0.5 + 0.05 * camera.focal))
     q, inside = footprints.squared_distance(torch.tensor([0]), row, column)
@@ -90,10 +80,12 @@ def test_a_point_spans_the_same_angle_in_every_projection(projection: str):
 
 @each_projection
 def test_solid_is_angular_with_the_opacity_of_the_larger_volume(projection: str, generator):
-    gaussians = mixture(20, generator, ("ordinary", "polar", "seam"))
+    gaussians = cases.mixture(20, generator, ("ordinary", "polar", "seam"))
     camera, pixels = camera_of(projection), torch.arange(64)
     kinds = ("angular", "solid")
-    angular, solid = (projected(gaussians, identity_pose(), camera, options_of(projection, kind)) for kind in kinds)
+    angular, solid = (
+        cases.projected(gaussians, cases.identity_pose(), camera, options_of(projection, kind)) for kind in kinds
+    )
     both = (angular.visible & solid.visible).nonzero()[:, 0]
     assert len(both) >= 2
     q = [footprints.squared_distance(both, pixels // 4, pixels)[0] for footprints in (angular, solid)]
@@ -109,9 +101,9 @@ def test_solid_is_angular_with_the_opacity_of_the_larger_volume(projection: str,
 @each_combination
 def test_large_gaussians_change_little(projection: str, kind: str):
     camera, large = camera_of(projection), small(0.1, 0.15)  # 1.5 pixels of filter on a standard deviation of 6
-    plain = render(large, View("v", identity_pose(), 64, 32, lens=camera), options_of(projection, kind, near=0.1))
+    plain = render(large, View("v", cases.identity_pose(), 64, 32, lens=camera), options_of(projection, kind, near=0.1))
     none = replace(options_of(projection, kind, near=0.1), low_pass=0.0)
-    sharp = render(large, View("v", identity_pose(), 64, 32, lens=camera), none)
+    sharp = render(large, View("v", cases.identity_pose(), 64, 32, lens=camera), none)
     wider = 1 + VARIANCE / (0.15 * camera.focal) ** 2
     faded = wider**-1.5 if kind == "solid" else 1.0
     assert plain.image.max() == pytest.approx(sharp.image.max().item() * faded, rel=0.01)
@@ -124,7 +116,7 @@ def test_the_unit_of_length_does_not_matter(projection: str, kind: str):
     images = []
     for radius in (0.5, 2.0, 300.0):
         gaussians = small(0.3, 0.02, radius)
-        view = View("v", identity_pose(), camera.width, camera.height, lens=camera)
+        view = View("v", cases.identity_pose(), camera.width, camera.height, lens=camera)
         images.append(render(gaussians, view, options_of(projection, kind)).image)
     for image in images[1:]:
         torch.testing.assert_close(image, images[0], rtol=0, atol=1e-9)
@@ -133,26 +125,26 @@ def test_the_unit_of_length_does_not_matter(projection: str, kind: str):
 
 def thin_mixture(generator: torch.Generator) -> Gaussians:
     """Return thin Gaussians about as large as the filter, which it affects most."""
-    gaussians = mixture(25, generator, ("ordinary", "polar", "seam"))
+    gaussians = cases.mixture(25, generator, ("ordinary", "polar", "seam"))
     shrink = 0.1 + 0.6 * torch.rand(75, 3, generator=generator, dtype=torch.float64)
     opacities = 0.5 + 0.5 * gaussians.opacities
     return replace(gaussians, scales=gaussians.scales * shrink, opacities=opacities).to(torch.float32).to(torch.float64)
 
 
 @each_combination
-@needs_native
+@cases.needs_native
 def test_native_matches_the_definition(projection: str, kind: str, generator):
-    gaussians, pose = thin_mixture(generator), random_pose(generator, shift=0.05)
+    gaussians, pose = thin_mixture(generator), cases.random_pose(generator, shift=0.05)
     camera, options = camera_of(projection, 96), options_of(projection, kind, near=0.02)
     weights = torch.rand(48, 96, 3, generator=generator, dtype=torch.float64)
-    weights *= stable_pixels(gaussians, 96, 48, lens=camera, pose=pose, options=options)[..., None]
+    weights *= cases.stable_pixels(gaussians, 96, 48, lens=camera, pose=pose, options=options)[..., None]
     arguments = (gaussians, camera, options, weights)
-    expected, expected_gradients = differentiated(*arguments, pose=pose, backend="torch", dtype=torch.float64)
-    actual, gradients = differentiated(*arguments, pose=pose, backend="cpu", dtype=torch.float32)
+    expected, expected_gradients = cases.differentiated(*arguments, pose=pose, backend="torch", dtype=torch.float64)
+    actual, gradients = cases.differentiated(*arguments, pose=pose, backend="cpu", dtype=torch.float32)
     assert expected.counters["visible"] >= 5
     assert ((actual.image - expected.image).abs() * (weights > 0)).max() < 2e-5
     for name, gradient in gradients.items():
-        assert row_error(gradient, expected_gradients[name]) < 2e-3, name
+        assert cases.row_error(gradient, expected_gradients[name]) < 2e-3, name
 
 
 @pytest.mark.parametrize("place", ["ordinary", "next to the pole", "across the seam"])
@@ -170,10 +162,10 @@ def test_gradients_match_differences(projection: str, kind: str, place: str, gen
         opacities=torch.tensor([0.8]).double(),
         colors=torch.tensor([[0.9, 0.5, 0.3]]).double(),
     )
-    view, options = View("v", identity_pose(), 40, 20, lens=camera), options_of(projection, kind)
+    view, options = View("v", cases.identity_pose(), 40, 20, lens=camera), options_of(projection, kind)
 
     def drawn(*inputs: torch.Tensor) -> torch.Tensor:
         return render(Gaussians(*inputs), view, options).image
 
-    inputs = vars(leaves(gaussians, torch.float64)).values()
+    inputs = vars(cases.leaves(gaussians, torch.float64)).values()
     assert torch.autograd.gradcheck(drawn, tuple(inputs), eps=1e-6, atol=1e-5, fast_mode=True)

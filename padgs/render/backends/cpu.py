@@ -14,16 +14,7 @@ from torch import Tensor
 
 from padgs.native import abi, cpu
 from padgs.native.abi import Inputs, pointer
-from padgs.render.backends.native import (
-    TILE,
-    NativeImage,
-    Pixels,
-    Strips,
-    Upstream,
-    native_camera,
-    native_rays,
-    strip_cuts,
-)
+from padgs.render.backends import native
 from padgs.render.contract import Removals
 
 
@@ -32,7 +23,7 @@ class Strip:
 
     def __init__(self, projected: Projected, first_row: int, end_row: int) -> None:
         camera, count = projected.camera, len(projected.boxes)
-        columns = -(-camera.width // TILE)
+        columns = -(-camera.width // native.TILE)
         per_row = -(-columns // (1 << projected.level[first_row:end_row].long()))
         self._row_start = torch.cat((torch.zeros(1, dtype=torch.int64), per_row.cumsum(0)))
         self._level = projected.level
@@ -55,7 +46,7 @@ class Strip:
         )
 
 
-class Projected(Strips[Strip]):
+class Projected(native.Strips[Strip]):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
     The number of (Gaussian, tile) instances is known before anything of that size is allocated. If it exceeds the
@@ -64,7 +55,7 @@ class Projected(Strips[Strip]):
 
     def __init__(self, camera: abi.NativeCamera, inputs: Inputs, max_instances: int) -> None:
         library, count = cpu.library(), inputs.count
-        rows = -(-camera.height // TILE)
+        rows = -(-camera.height // native.TILE)
         self.camera = camera
         self.footprints = torch.empty(count, 16)
         self.boxes = torch.empty(count, 5, dtype=torch.int32)
@@ -78,7 +69,7 @@ class Projected(Strips[Strip]):
         self.per_row = torch.empty(rows, dtype=torch.int64)
         library.padgs_count_instances(pointer(self.boxes), count, pointer(self.level), rows, pointer(self.per_row))
         self.instances = int(self.per_row.sum())
-        super().__init__(Strip, strip_cuts(self.per_row.tolist(), max_instances))
+        super().__init__(Strip, native.strip_cuts(self.per_row.tolist(), max_instances))
 
 
 @dataclass
@@ -97,7 +88,7 @@ class _Cores:
         arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
 
 
-class _Image(NativeImage):
+class _Image(native.NativeImage):
     @staticmethod
     def check(means: Tensor) -> None:
         if means.dtype != torch.float32 or means.device.type != "cpu":
@@ -106,10 +97,12 @@ class _Image(NativeImage):
                 "use backend=torch"
             )
 
-    def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
+    def draw(
+        self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool
+    ) -> tuple[native.Pixels, Tensor]:
         camera, options = self.camera, self.options
-        self._projected = Projected(native_camera(pose, camera, options), inputs, options.max_instances)
-        self.rays = native_rays(camera)
+        self._projected = Projected(native.native_camera(pose, camera, options), inputs, options.max_instances)
+        self.rays = native.native_rays(camera)
         size = (camera.height, camera.width)
         pixels = (torch.empty(*size, 3), torch.empty(size), torch.empty(size))
         self._last = torch.empty(size, dtype=torch.int32)  # position of the last contribution to each pixel
@@ -133,7 +126,7 @@ class _Image(NativeImage):
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
         return pixels, visible
 
-    def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
+    def gradient_sums(self, pixels: native.Pixels, background: Tensor, upstream: native.Upstream) -> Tensor:
         count = len(self._projected.boxes)
         totals = torch.zeros(count, abi.GRADIENT_SUMS)
         for number, strip in enumerate(self._projected.strips()):
@@ -147,7 +140,7 @@ class _Image(NativeImage):
             cpu.library().padgs_sum_moments(pointer(sums), pointer(strip.slot_start), count, pointer(totals))
         return totals
 
-    def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
+    def removals(self, pixels: native.Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
         count = len(self._projected.boxes)
         sums, peak = torch.zeros(count, abi.REMOVAL - 1, dtype=torch.float64), torch.zeros(count)
         for strip in self._projected.strips():
@@ -174,7 +167,7 @@ class _Image(NativeImage):
         return pose_gradient
 
     def _blend_arguments(
-        self, strip: Strip, background: Tensor, pixels: Pixels, pair_counts: Tensor | None
+        self, strip: Strip, background: Tensor, pixels: native.Pixels, pair_counts: Tensor | None
     ) -> abi.BlendArguments:
         """Return the arguments of both blending passes; the tensors must outlive the call."""
         projected, options = self._projected, self.options

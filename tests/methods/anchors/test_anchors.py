@@ -8,19 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from padgs.methods.anchors.anchors import (
-    Decoded,
-    PaDGS,
-    PaDGSOptions,
-    anchors_from_points,
-    automatic_voxel_size,
-    cell_keys,
-    cells_from_points,
-    initial_log_scales,
-    occupied,
-    points_from_cells,
-    unique_cells,
-)
+from padgs.methods.anchors import anchors
 from padgs.native import cpu
 from padgs.render import BACKENDS, RenderOptions, render
 from padgs.scene import Scene, View
@@ -44,9 +32,9 @@ def golden(shared):
     }
 
 
-def golden_model(golden, dtype, **options) -> PaDGS:
-    options = PaDGSOptions(**{"distance_unit": "world", "voxel_size": 0.1, **options})
-    model = PaDGS(golden["anchors"].clone(), golden["log_scales"].clone(), options, voxel_size=0.1)
+def golden_model(golden, dtype, **options) -> anchors.PaDGS:
+    options = anchors.PaDGSOptions(**{"distance_unit": "world", "voxel_size": 0.1, **options})
+    model = anchors.PaDGS(golden["anchors"].clone(), golden["log_scales"].clone(), options, voxel_size=0.1)
     with torch.no_grad():
         model.features.copy_(golden["features"])
         model.offsets.copy_(golden["offsets"])
@@ -62,7 +50,7 @@ def golden_view(golden) -> View:
     return View("golden", pose, golden["meta"]["width"], golden["meta"]["height"])
 
 
-def assert_decoded(decoded: Decoded, golden, prefix: str, tolerance: float = 1e-5) -> None:
+def assert_decoded(decoded: anchors.Decoded, golden, prefix: str, tolerance: float = 1e-5) -> None:
     selected = golden[f"{prefix}raw_opacities"] > 0
     assert torch.equal(decoded.raw_opacities.flatten() > 0, selected)
     assert torch.equal(decoded.slots, selected.nonzero()[:, 0])
@@ -133,7 +121,7 @@ def box_scene(*, scale: float = 1.0, count: int = 500) -> Scene:
     return Scene("box", tuple(views), (), (scale * points).float(), colors, "0")
 
 
-def perturbed(model: PaDGS) -> PaDGS:
+def perturbed(model: anchors.PaDGS) -> anchors.PaDGS:
     """The model as training might leave it: nothing at its initial value."""
     generator = torch.Generator().manual_seed(11)
     with torch.no_grad():
@@ -142,10 +130,10 @@ def perturbed(model: PaDGS) -> PaDGS:
     return model
 
 
-def one_anchor(position, options=PaDGSOptions(), dtype=torch.float32) -> PaDGS:  # noqa: B008
+def one_anchor(position, options=anchors.PaDGSOptions(), dtype=torch.float32) -> anchors.PaDGS:  # noqa: B008
     generator = torch.Generator().manual_seed(3)
     position = torch.tensor([position], dtype=torch.float32)
-    model = PaDGS(position, torch.full((1, 6), -2.0), options, voxel_size=0.1, generator=generator)
+    model = anchors.PaDGS(position, torch.full((1, 6), -2.0), options, voxel_size=0.1, generator=generator)
     return perturbed(model).to(dtype)
 
 
@@ -158,15 +146,15 @@ def view_from(center, rotation=None) -> View:
 
 
 def test_number_of_network_inputs():
-    assert PaDGSOptions().inputs == 37
-    assert PaDGSOptions(use_distortion=False).inputs == 36
-    assert PaDGSOptions(use_distortion=False, use_distance=False).inputs == 35
+    assert anchors.PaDGSOptions().inputs == 37
+    assert anchors.PaDGSOptions(use_distortion=False).inputs == 36
+    assert anchors.PaDGSOptions(use_distortion=False, use_distance=False).inputs == 35
 
 
 @pytest.mark.parametrize("use_distance", [True, False])
 @pytest.mark.parametrize("use_distortion", [True, False])
 def test_unused_inputs_change_nothing(use_distance, use_distortion):
-    options = PaDGSOptions(use_distance=use_distance, use_distortion=use_distortion, tau=0.0)
+    options = anchors.PaDGSOptions(use_distance=use_distance, use_distortion=use_distortion, tau=0.0)
     model = one_anchor([0.0, 0.0, 0.0], options)
     near, far = (model.decode(view_from(center)).raw_opacities for center in ([0.0, 0.0, -1.0], [0.0, 0.0, -5.0]))
     assert torch.equal(near, far) != use_distance
@@ -186,7 +174,9 @@ def test_direction_points_from_camera_to_anchor_in_the_world_frame():
 
 
 def test_opacity_modulation_follows_the_latitude_in_the_camera():
-    bright, dim = (one_anchor([0.0, -2.0, 0.0], PaDGSOptions(tau=tau, use_distortion=False)) for tau in (0.0, 0.9))
+    bright, dim = (
+        one_anchor([0.0, -2.0, 0.0], anchors.PaDGSOptions(tau=tau, use_distortion=False)) for tau in (0.0, 0.9)
+    )
     view = view_from([0.0, 0.0, 0.0])
     full, modulated = bright.decode(view).gaussians.opacities, dim.decode(view).gaussians.opacities
     assert len(full) > 0 and torch.allclose(modulated, 0.1 * full)
@@ -197,7 +187,7 @@ def test_opacity_modulation_follows_the_latitude_in_the_camera():
 @pytest.mark.parametrize("overrides", [{}, RELEASED])
 @pytest.mark.parametrize("position", [[0, 2, 0], [0, -2, 0], [0, 0, 2], [0, 0, -2], [0, 0, 0], [1e-9, 0, 0]])
 def test_gradients_are_finite_at_the_poles_and_at_the_camera(overrides, position):
-    model = one_anchor([float(x) for x in position], PaDGSOptions(**overrides))
+    model = one_anchor([float(x) for x in position], anchors.PaDGSOptions(**overrides))
     decoded = model.decode(view_from([0.0, 0.0, 0.0]))
     assert len(decoded.slots) > 0
     torch.cat([value.flatten() for value in vars(decoded.gaussians).values()]).sum().backward()
@@ -213,7 +203,7 @@ def test_positions_and_views_have_no_gradient():
 
 
 def test_decoding_is_invariant_to_world_units():
-    small, large = (perturbed(PaDGS.from_scene(box_scene(scale=scale))) for scale in (1.0, 100.0))
+    small, large = (perturbed(anchors.PaDGS.from_scene(box_scene(scale=scale))) for scale in (1.0, 100.0))
     assert large.voxel_size == pytest.approx(100 * small.voxel_size)
     assert torch.allclose(large.positions, 100 * small.positions, rtol=1e-6)
     seen = [model.decode(box_scene(scale=scale).train[1]) for model, scale in ((small, 1.0), (large, 100.0))]
@@ -226,14 +216,14 @@ def test_decoding_is_invariant_to_world_units():
 
 
 def test_seeds_determine_the_networks():
-    first, same, other = (PaDGS.from_scene(box_scene(), seed=seed).decoder.opacity["w1"] for seed in (1, 1, 2))
+    first, same, other = (anchors.PaDGS.from_scene(box_scene(), seed=seed).decoder.opacity["w1"] for seed in (1, 1, 2))
     assert torch.equal(first, same) and not torch.equal(first, other)
 
 
 @pytest.mark.parametrize("precision", ["bfloat16", "float16"])
 def test_reduced_precision_rounds_networks_only_and_keeps_float32_gradients(precision):
     exact, rounded = (
-        perturbed(PaDGS.from_scene(box_scene(count=40), PaDGSOptions(precision=name)))
+        perturbed(anchors.PaDGS.from_scene(box_scene(count=40), anchors.PaDGSOptions(precision=name)))
         for name in ("float32", precision)
     )
     view, limit = box_scene().train[1], 8 * torch.finfo(getattr(torch, precision)).eps
@@ -250,7 +240,9 @@ def test_reduced_precision_rounds_networks_only_and_keeps_float32_gradients(prec
 
 
 def test_gradients_match_finite_differences():
-    model = perturbed(PaDGS.from_scene(box_scene(count=4), PaDGSOptions(features=3, offsets=2, hidden=4))).double()
+    model = perturbed(
+        anchors.PaDGS.from_scene(box_scene(count=4), anchors.PaDGSOptions(features=3, offsets=2, hidden=4))
+    ).double()
     view = box_scene().train[1]
     names = [name for name, _ in model.named_parameters()]
 
@@ -287,50 +279,52 @@ class _Decode(torch.nn.Module):
 )
 def test_invalid_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        PaDGSOptions(**options)
+        anchors.PaDGSOptions(**options)
 
 
 def test_anchors_are_the_distinct_nearest_vertices():
     points = torch.tensor([[0.24, 0.0, 0.0], [0.26, 0.0, 0.0], [-0.26, 0.6, 0.0], [0.2, 0.1, -0.1]])
     expected = torch.tensor([[-0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    assert torch.equal(anchors_from_points(points, 0.5), expected)
-    assert cells_from_points(torch.tensor([[0.5, 1.5, -0.5]]), 1.0).tolist() == [[0, 2, 0]], "halves go to even"
+    assert torch.equal(anchors.anchors_from_points(points, 0.5), expected)
+    assert anchors.cells_from_points(torch.tensor([[0.5, 1.5, -0.5]]), 1.0).tolist() == [[0, 2, 0]], "halves go to even"
 
 
 @pytest.mark.parametrize("size", [0.001, 0.037, 5.0])
 def test_cells_survive_conversion_to_float32_positions(size, generator):
     cells = torch.randint(-(2**20), 2**20, (2000, 3), generator=generator)
-    assert torch.equal(cells_from_points(points_from_cells(cells, size), size), cells)
+    assert torch.equal(anchors.cells_from_points(anchors.points_from_cells(cells, size), size), cells)
 
 
 @pytest.mark.parametrize("spread", [3, 2**40])  # narrow: digits of one number; wide: more than 64 bits
 def test_unique_and_occupied_cells_match_python_sets(spread, generator):
     cells = torch.randint(-spread, spread, (300, 3), generator=generator)
     cells = torch.cat((cells, cells[::3], torch.tensor([[-spread] * 3, [spread] * 3])))
-    unique, inverse = unique_cells(cells)
+    unique, inverse = anchors.unique_cells(cells)
     assert [tuple(row) for row in unique.tolist()] == sorted({tuple(row) for row in cells.tolist()})
     assert torch.equal(unique[inverse], cells)
-    assert len(cell_keys(cells).unique()) == len(unique)
+    assert len(anchors.cell_keys(cells).unique()) == len(unique)
     by = torch.randint(-spread, spread, (200, 3), generator=generator)
     cells = torch.cat((torch.randint(-spread, spread, (200, 3), generator=generator), by[::7]))
     there = {tuple(row) for row in by.tolist()}
-    assert occupied(cells, by).tolist() == [tuple(row) in there for row in cells.tolist()]
+    assert anchors.occupied(cells, by).tolist() == [tuple(row) in there for row in cells.tolist()]
 
 
 def test_empty_sets_of_cells():
     nothing = torch.zeros(0, 3, dtype=torch.int64)
-    assert [len(part) for part in unique_cells(nothing)] == [0, 0]
-    assert occupied(nothing, torch.ones(2, 3, dtype=torch.int64)).shape == (0,)
-    assert occupied(torch.ones(2, 3, dtype=torch.int64), nothing).tolist() == [False, False]
+    assert [len(part) for part in anchors.unique_cells(nothing)] == [0, 0]
+    assert anchors.occupied(nothing, torch.ones(2, 3, dtype=torch.int64)).shape == (0,)
+    assert anchors.occupied(torch.ones(2, 3, dtype=torch.int64), nothing).tolist() == [False, False]
 
 
 def test_initial_scale_is_the_root_mean_square_of_three_distances():
     positions = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0], [0, 0, 3.0], [100.0, 0, 0]])
-    log_scales = initial_log_scales(positions, 1.0)
+    log_scales = anchors.initial_log_scales(positions, 1.0)
     assert log_scales.shape == (5, 6) and log_scales.dtype == torch.float32
     assert torch.allclose(log_scales[0], torch.tensor(0.5 * math.log((1 + 4 + 9) / 3)))
-    assert initial_log_scales(torch.zeros(1, 3), 0.25).eq(math.log(0.25)).all(), "an anchor alone has the voxel size"
-    two = initial_log_scales(torch.tensor([[0.0, 0, 0], [0, 4.0, 0]]), 1.0)
+    assert anchors.initial_log_scales(torch.zeros(1, 3), 0.25).eq(math.log(0.25)).all(), (
+        "an anchor alone has the voxel size"
+    )
+    two = anchors.initial_log_scales(torch.tensor([[0.0, 0, 0], [0, 4.0, 0]]), 1.0)
     assert torch.allclose(two, torch.tensor(math.log(4.0)))
 
 
@@ -339,11 +333,11 @@ def test_automatic_voxel_size(scale):
     points = scale * torch.tensor([[0.0, 0.0, 5.0], [0.0, 5.0, 0.0], [-5.0, 0.0, 0.0]])
     view = View("v", torch.eye(4, dtype=torch.float64), 400, 200)
     scene = Scene("s", (view,), (), points, torch.zeros(3, 3, dtype=torch.uint8), "0")
-    assert automatic_voxel_size(scene, 0.25) == pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
+    assert anchors.automatic_voxel_size(scene, 0.25) == pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
 
 
 def test_invalid_clouds_are_refused():
     with pytest.raises(ValueError, match="point cloud is empty"):
-        anchors_from_points(torch.zeros(0, 3), 0.1)
+        anchors.anchors_from_points(torch.zeros(0, 3), 0.1)
     with pytest.raises(ValueError, match="point 1 of the cloud is"):
-        anchors_from_points(torch.tensor([[0.0, 0, 0], [0, float("nan"), 0]]), 0.1)
+        anchors.anchors_from_points(torch.tensor([[0.0, 0, 0], [0, float("nan"), 0]]), 0.1)

@@ -6,20 +6,7 @@ import math
 
 import pytest
 import torch
-from support.render_cases import (
-    INPUTS,
-    SETUPS,
-    camera_of,
-    chosen,
-    draw,
-    each_engine,
-    each_setup,
-    gaussians_of,
-    identity_pose,
-    joined,
-    leaves,
-    view_of,
-)
+from support import render_cases as cases
 from test_parity import ENGINES_IN_FLOAT32, assert_same
 
 from padgs.gaussians import Gaussians
@@ -53,12 +40,12 @@ EXTREME = {
 
 
 @pytest.mark.parametrize("name", EXTREME)
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_extreme_gaussians_stay_finite(name: str, projection, lens, backend, dtype):
-    both = joined(EXTREME[name], gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)))
-    inputs, pose = leaves(both, dtype), identity_pose().to(dtype).requires_grad_()
-    view = view_of(camera_of(lens, 32, 16), pose)
+    both = cases.joined(EXTREME[name], cases.gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)))
+    inputs, pose = cases.leaves(both, dtype), cases.identity_pose().to(dtype).requires_grad_()
+    view = cases.view_of(cases.camera_of(lens, 32, 16), pose)
     settings = ({}, {"low_pass": 0.0}, {"wrap": False}) if projection == "erp" else ({}, {"low_pass": 0.0})
     for options in (RenderOptions(projection, **some) for some in settings):
         rendering = render(inputs, view, options, backend=backend)
@@ -66,27 +53,27 @@ def test_extreme_gaussians_stay_finite(name: str, projection, lens, backend, dty
         for output in outputs:
             assert torch.isfinite(output).all()
         gradients = torch.autograd.grad(sum(output.sum() for output in outputs), [*vars(inputs).values(), pose])
-        for key, gradient in zip((*INPUTS, "pose"), gradients, strict=True):
+        for key, gradient in zip((*cases.INPUTS, "pose"), gradients, strict=True):
             assert torch.isfinite(gradient).all(), key
         stepped = Gaussians(
-            **{key: getattr(inputs, key).detach() - 1e-4 * g for key, g in zip(INPUTS, gradients, strict=False)}
+            **{key: getattr(inputs, key).detach() - 1e-4 * g for key, g in zip(cases.INPUTS, gradients, strict=False)}
         )
         assert torch.isfinite(render(stepped, view, options, backend=backend).image).all()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_non_finite_gaussians_are_not_rendered(name: str, bad: float, projection, lens, backend, dtype):
-    gaussians = gaussians_of("ordinary", 4, torch.Generator().manual_seed(2))
-    broken, options = leaves(gaussians, dtype), RenderOptions(projection)
+    gaussians = cases.gaussians_of("ordinary", 4, torch.Generator().manual_seed(2))
+    broken, options = cases.leaves(gaussians, dtype), RenderOptions(projection)
     getattr(broken, name).data[1] = bad
     engine = {"backend": backend, "dtype": dtype, "lens": lens, "options": options}
-    pose = identity_pose().to(dtype).requires_grad_()
-    rendering = render(broken, view_of(camera_of(lens, 32, 16), pose), options, backend=backend)
+    pose = cases.identity_pose().to(dtype).requires_grad_()
+    rendering = render(broken, cases.view_of(cases.camera_of(lens, 32, 16), pose), options, backend=backend)
     if (name, bad) != ("opacities", math.inf):  # an opacity above the maximum is limited to it
-        expected = draw(chosen(gaussians, torch.tensor([0, 2, 3])), 32, 16, **engine)
+        expected = cases.draw(cases.chosen(gaussians, torch.tensor([0, 2, 3])), 32, 16, **engine)
         torch.testing.assert_close(rendering.image, expected.image, rtol=0, atol=1e-6)
         rendering.image.sum().backward()
         assert torch.isfinite(broken.colors.grad).all() and torch.isfinite(broken.means.grad).all()
@@ -95,7 +82,7 @@ def test_non_finite_gaussians_are_not_rendered(name: str, bad: float, projection
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("projection", "lens"), [setup for setup in SETUPS if setup[0] in ("erp", "pinhole")])
+@pytest.mark.parametrize(("projection", "lens"), [setup for setup in cases.SETUPS if setup[0] in ("erp", "pinhole")])
 @pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
 def test_long_oblique_needles_in_float32(projection, lens, backend, dtype):
     """Hundreds of pixels long and thinner than one: du^2, du dv and dv^2 are large, but their sum is small."""

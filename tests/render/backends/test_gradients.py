@@ -6,21 +6,7 @@ import math
 
 import pytest
 import torch
-from support.render_cases import (
-    INPUTS,
-    SETUPS,
-    camera_of,
-    each_engine,
-    each_native_engine,
-    each_setup,
-    engines,
-    gaussians_of,
-    identity_pose,
-    leaves,
-    random_pose,
-    stable_pixels,
-    view_of,
-)
+from support import render_cases as cases
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
@@ -30,7 +16,9 @@ from padgs.render import RenderOptions, render
 
 WIDTH, HEIGHT = 48, 24
 PLACES = ("random", "pole", "seam")
-PLACES_OF_SETUPS = [(*setup, place) for setup in SETUPS for place in (PLACES if "panorama" in setup else PLACES[:1])]
+PLACES_OF_SETUPS = [
+    (*setup, place) for setup in cases.SETUPS for place in (PLACES if "panorama" in setup else PLACES[:1])
+]
 # By precision: scenes for each place; step (in units of what moves a footprint by its own size); largest median and
 # 99th percentile of the relative error; largest |ratio of magnitudes - 1|, which a dropped term cannot pass. float32
 # rounds an image to 1e-7, so that its differences need longer steps and are worth fewer digits.
@@ -43,7 +31,7 @@ LIMITS = {
 def scene_at(place: str, projection: str, lens: str, generator: torch.Generator) -> Gaussians:
     """Six Gaussians, some pixels broad, near enough to overlap; none reaches the maximum alpha or stops a ray."""
     count = 6
-    gaussians = gaussians_of("ordinary", count, generator)
+    gaussians = cases.gaussians_of("ordinary", count, generator)
     radius = gaussians.means.norm(dim=-1)
 
     def uniform(low: float, high: float) -> Tensor:
@@ -98,9 +86,9 @@ class Scene:
     """Six Gaussians, weights of all outputs, and the weighted loss."""
 
     def __init__(self, place: str, projection: str, lens: str, generator: torch.Generator, dtype: torch.dtype) -> None:
-        self.camera, self.options = camera_of(lens, WIDTH, HEIGHT), RenderOptions(projection)
+        self.camera, self.options = cases.camera_of(lens, WIDTH, HEIGHT), RenderOptions(projection)
         self.gaussians = scene_at(place, projection, lens, generator)
-        stable = stable_pixels(self.gaussians, WIDTH, HEIGHT, lens=lens, options=self.options, margin=0.2)
+        stable = cases.stable_pixels(self.gaussians, WIDTH, HEIGHT, lens=lens, options=self.options, margin=0.2)
         assert stable.double().mean() > 0.4  # no pair crosses the cut within a step
         shape = (HEIGHT, WIDTH)
         self.weights = {
@@ -109,7 +97,7 @@ class Scene:
             "depth": 0.2 * torch.randn(shape, generator=generator, dtype=torch.float64) * stable,
         }
         self.inputs = {
-            **{name: tensor.detach() for name, tensor in vars(leaves(self.gaussians, dtype)).items()},
+            **{name: tensor.detach() for name, tensor in vars(cases.leaves(self.gaussians, dtype)).items()},
             "mean_offsets": torch.zeros(len(self.gaussians), 2, dtype=dtype),
             "twist": torch.zeros(6, dtype=dtype),
             "background": torch.tensor([0.2, 0.7, 0.4], dtype=dtype),
@@ -120,7 +108,7 @@ class Scene:
     def loss(self, values: dict[str, Tensor], backend: str) -> Tensor:
         model = Gaussians(**{name: values[name] for name in vars(self.gaussians)})
         camera = RayTable(values["rays"], self.camera.focal) if "rays" in values else self.camera
-        view = view_of(camera, tangent_pose(identity_pose().to(values["twist"].dtype), values["twist"]))
+        view = cases.view_of(camera, tangent_pose(cases.identity_pose().to(values["twist"].dtype), values["twist"]))
         extra = {"mean_offsets": values["mean_offsets"], "background": values["background"], "backend": backend}
         rendering = render(model, view, self.options, **extra)
         return sum((getattr(rendering, name).double() * weight).sum() for name, weight in self.weights.items())
@@ -148,7 +136,7 @@ def slopes(scene: Scene, step: float, backend: str, generator: torch.Generator) 
 
 
 @pytest.mark.parametrize(("projection", "lens", "place"), PLACES_OF_SETUPS)
-@pytest.mark.parametrize(("backend", "dtype"), [engine for engine in engines() if engine.id != "torch-32"])
+@pytest.mark.parametrize(("backend", "dtype"), [engine for engine in cases.engines() if engine.id != "torch-32"])
 def test_gradients_match_central_differences(projection: str, lens: str, place: str, backend, dtype):
     scenes, step, median_limit, tail_limit, ratio_limit = LIMITS[dtype]
     generator = torch.Generator().manual_seed(8 + PLACES.index(place))
@@ -169,17 +157,17 @@ def test_gradients_match_central_differences(projection: str, lens: str, place: 
         assert abs(ratio - 1) < ratio_limit, report
 
 
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 def test_every_output_alone_has_gradients(projection: str, lens: str, backend: str, dtype: torch.dtype):
     """No other output has one then; every Gaussian is in the image, so that no row is empty."""
     generator = torch.Generator().manual_seed(11)
-    gaussians, pose = gaussians_of("ordinary", 20, generator), random_pose(generator, shift=0.1)
+    gaussians, pose = cases.gaussians_of("ordinary", 20, generator), cases.random_pose(generator, shift=0.1)
     if lens != "panorama":  # in front of it
         pose[:3, :3] = torch.eye(3)
         ahead = gaussians.means.abs() * torch.tensor([0.3, 0.3, 1.0]) + 0.3
         gaussians = Gaussians(**{**vars(gaussians), "means": ahead})
-    inputs, camera = vars(leaves(gaussians, dtype)), camera_of(lens, 64, 32)
+    inputs, camera = vars(cases.leaves(gaussians, dtype)), cases.camera_of(lens, 64, 32)
     extra = {"background": torch.full((3,), 0.5), "mean_offsets": torch.zeros(20, 2)}
     extra = {name: value.to(dtype).requires_grad_() for name, value in extra.items()}
     everything = {**inputs, **extra, "pose": pose.to(dtype).requires_grad_()}
@@ -187,7 +175,7 @@ def test_every_output_alone_has_gradients(projection: str, lens: str, backend: s
         everything["rays"] = camera.table.to(dtype).requires_grad_()
         camera = RayTable(everything["rays"], camera.focal)
     for output in ("image", "transmittance", "depth"):
-        view, options = view_of(camera, everything["pose"]), RenderOptions(projection)
+        view, options = cases.view_of(camera, everything["pose"]), RenderOptions(projection)
         value = getattr(render(Gaussians(**inputs), view, options, backend=backend, **extra), output)
         weight = torch.randn(value.shape, generator=generator, dtype=torch.float64).to(dtype)
         gradients = torch.autograd.grad((value * weight).sum(), list(everything.values()), allow_unused=True)
@@ -202,18 +190,18 @@ def test_every_output_alone_has_gradients(projection: str, lens: str, backend: s
             assert (norms != 0).double().mean() >= share, f"{output} by {name} has empty rows"
 
 
-@pytest.mark.parametrize("projection", sorted({projection for projection, lens in SETUPS if lens == "panorama"}))
-@each_native_engine
+@pytest.mark.parametrize("projection", sorted({projection for projection, lens in cases.SETUPS if lens == "panorama"}))
+@cases.each_native_engine
 def test_gradients_of_subsets_of_inputs(projection: str, backend: str):
     """Gradients of a subset of inputs equal those computed together with all others."""
     generator = torch.Generator().manual_seed(14)
-    gaussians = gaussians_of("ordinary", 12, generator)
+    gaussians = cases.gaussians_of("ordinary", 12, generator)
     weight = torch.randn(HEIGHT, WIDTH, 3, generator=generator)
 
     def gradients(names: tuple[str, ...]) -> dict[str, Tensor]:
-        values = {name: getattr(gaussians, name).float().requires_grad_(name in names) for name in INPUTS}
-        pose = identity_pose().float().requires_grad_("pose" in names)
-        view = view_of(camera_of("panorama", WIDTH, HEIGHT), pose)
+        values = {name: getattr(gaussians, name).float().requires_grad_(name in names) for name in cases.INPUTS}
+        pose = cases.identity_pose().float().requires_grad_("pose" in names)
+        view = cases.view_of(cases.camera_of("panorama", WIDTH, HEIGHT), pose)
         image = render(Gaussians(**values), view, RenderOptions(projection), backend=backend).image
         wanted = {**values, "pose": pose}
         return dict(zip(names, torch.autograd.grad((image * weight).sum(), [wanted[n] for n in names]), strict=True))

@@ -4,19 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from support.render_cases import (
-    KINDS,
-    ODD_SIZES,
-    SETUPS,
-    assert_matches_definition,
-    camera_of,
-    engines,
-    gaussians_of,
-    mixture,
-    needs_native,
-    random_pose,
-    stable_pixels,
-)
+from support import render_cases as cases
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions
@@ -29,20 +17,20 @@ CONFIGURATIONS = {
 }
 COMBINATIONS = [
     (projection, lens, name, kind)
-    for projection, lens in SETUPS
+    for projection, lens in cases.SETUPS
     for name in CONFIGURATIONS
-    for kind in KINDS
+    for kind in cases.KINDS
     if not (name == "no wrap" and projection != "erp")
     and not (name == "published" and (projection == "ray" or (projection == "tangent" and lens != "panorama")))
     and not (lens == "pinhole" and kind in ("polar", "pole", "seam"))  # it sees too few of them
 ]
-ENGINES_IN_FLOAT32 = [engine for engine in engines() if torch.float32 in engine.values]
+ENGINES_IN_FLOAT32 = [engine for engine in cases.engines() if torch.float32 in engine.values]
 
 
 def assert_same(gaussians: Gaussians, size, lens, options, generator, **engine) -> None:
-    stable = stable_pixels(gaussians, *size, lens=lens, pose=engine["pose"], options=options)
+    stable = cases.stable_pixels(gaussians, *size, lens=lens, pose=engine["pose"], options=options)
     assert stable.double().mean() > 0.85
-    assert_matches_definition(gaussians, camera_of(lens, *size), options, stable, generator, **engine)
+    cases.assert_matches_definition(gaussians, cases.camera_of(lens, *size), options, stable, generator, **engine)
 
 
 @pytest.mark.parametrize(
@@ -50,12 +38,12 @@ def assert_same(gaussians: Gaussians, size, lens, options, generator, **engine) 
 )
 @pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
 def test_every_engine_agrees_with_the_definition(projection, lens, configuration, kind, backend, dtype):
-    generator = torch.Generator().manual_seed(KINDS.index(kind))
+    generator = torch.Generator().manual_seed(cases.KINDS.index(kind))
     options = RenderOptions(projection, **CONFIGURATIONS[configuration])
-    size = ODD_SIZES[KINDS.index(kind) % len(ODD_SIZES)]
-    gaussians = gaussians_of(kind, 25, generator)
+    size = cases.ODD_SIZES[cases.KINDS.index(kind) % len(cases.ODD_SIZES)]
+    gaussians = cases.gaussians_of(kind, 25, generator)
     gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
-    pose = random_pose(generator)
+    pose = cases.random_pose(generator)
     if kind in ("ordinary", "huge", "needle"):
         pose[:3, 3] = torch.tensor([0.25, -0.125, 0.5])
     elif lens == "panorama":  # these places are named in the camera frame
@@ -69,10 +57,10 @@ def test_every_engine_agrees_with_the_definition(projection, lens, configuration
 
 
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
-@needs_native
+@cases.needs_native
 def test_a_large_odd_image_agrees(projection: str):
     generator = torch.Generator().manual_seed(9)
-    gaussians = mixture(3, generator, ("ordinary", "polar", "seam", "needle"))
+    gaussians = cases.mixture(3, generator, ("ordinary", "polar", "seam", "needle"))
     pose = torch.eye(4, dtype=torch.float64)
     engine = {"backend": "cpu", "dtype": torch.float32}
     options = RenderOptions(projection)

@@ -8,23 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import render_cases as cases
 from support.definition import MARGIN, alphas, blended, near_a_decision
 from support.native_tiles import pixel_boxes
-from support.render_cases import (
-    KINDS,
-    ODD_SIZES,
-    RELEASED,
-    SETUPS,
-    camera_of,
-    chosen,
-    draw,
-    each_engine,
-    each_setup,
-    gaussians_of,
-    identity_pose,
-    needs_native,
-    view_of,
-)
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
@@ -33,9 +19,9 @@ from padgs.geometry.panorama import direction
 from padgs.render import RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 
-KINDS_OF_SCENE = st.sampled_from(KINDS)
+KINDS_OF_SCENE = st.sampled_from(cases.KINDS)
 SEEDS = st.integers(0, 2**31)
-SIZES = st.sampled_from([*ODD_SIZES, (64, 32), (1, 1), (16, 16), (17, 3), (3, 40)])
+SIZES = st.sampled_from([*cases.ODD_SIZES, (64, 32), (1, 1), (16, 16), (17, 3), (3, 40)])
 NEAR = st.sampled_from([0.0, 0.0, 0.02, 1.5])
 few = settings(max_examples=8, deadline=None, derandomize=True, database=None)
 more = settings(max_examples=20, deadline=None, derandomize=True, database=None)
@@ -56,16 +42,19 @@ def unsure(gaussians: Gaussians, camera: Camera, options: RenderOptions, alpha: 
     return pairs
 
 
-@each_setup
-@each_engine
+@cases.each_setup
+@cases.each_engine
 @few
 @given(kind=KINDS_OF_SCENE, seed=SEEDS, size=SIZES, near=NEAR, wrap=st.booleans())
 def test_no_contribution_is_lost(kind, seed, size, near, wrap, backend, dtype, projection: str, lens: str):
-    gaussians = gaussians_of(kind, 15, torch.Generator().manual_seed(seed))
-    options, camera = RenderOptions(projection, near=near, wrap=wrap or projection != "erp"), camera_of(lens, *size)
+    gaussians = cases.gaussians_of(kind, 15, torch.Generator().manual_seed(seed))
+    options, camera = (
+        RenderOptions(projection, near=near, wrap=wrap or projection != "erp"),
+        cases.camera_of(lens, *size),
+    )
     alpha = alphas(gaussians, camera, options)
     expected = blended(gaussians, alpha)
-    rendering = draw(gaussians, *size, backend=backend, dtype=dtype, lens=lens, options=options)
+    rendering = cases.draw(gaussians, *size, backend=backend, dtype=dtype, lens=lens, options=options)
     firm = ~unsure(gaussians, camera, options, alpha).any(0)
     tolerance = 1e-9 if dtype == torch.float64 else 2e-5
     assert ((rendering.image.reshape(-1, 3) - expected).abs().amax(-1)[firm] <= tolerance).all()
@@ -73,18 +62,18 @@ def test_no_contribution_is_lost(kind, seed, size, near, wrap, backend, dtype, p
     assert rendering.visible[must_be_visible].all()
 
 
-@each_setup
-@needs_native
+@cases.each_setup
+@cases.needs_native
 @more
 @given(kind=KINDS_OF_SCENE, seed=SEEDS, size=SIZES, near=NEAR, wrap=st.booleans())
 def test_each_gaussian_alone_covers_all_its_pixels(kind, seed, size, near, wrap, projection: str, lens: str):
-    gaussians = gaussians_of(kind, 12, torch.Generator().manual_seed(seed))
+    gaussians = cases.gaussians_of(kind, 12, torch.Generator().manual_seed(seed))
     options = RenderOptions(projection, near=near, wrap=wrap or projection != "erp")
-    view = view_of(camera_of(lens, *size))
+    view = cases.view_of(cases.camera_of(lens, *size))
     alpha = alphas(gaussians, view.camera, options)
     perhaps = unsure(gaussians, view.camera, options, alpha)
     for index in range(len(gaussians)):
-        alone = chosen(gaussians, slice(index, index + 1)).to(torch.float32)
+        alone = cases.chosen(gaussians, slice(index, index + 1)).to(torch.float32)
         covered = render(alone, view, options, backend="cpu").transmittance.flatten() < 1
         wrong = (covered != (alpha[index] >= ALPHA_MIN)) & ~perhaps[index]
         assert not wrong.any(), f"Gaussian {index}, pixels {wrong.nonzero()[:4, 0].tolist()}"
@@ -92,9 +81,9 @@ def test_each_gaussian_alone_covers_all_its_pixels(kind, seed, size, near, wrap,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(72, 36), (300, 100), (1000, 500)])
-@pytest.mark.parametrize("kind", KINDS)
-@each_setup
-@needs_native
+@pytest.mark.parametrize("kind", cases.KINDS)
+@cases.each_setup
+@cases.needs_native
 def test_no_gaussian_of_many_loses_a_pixel(kind: str, size: tuple[int, int], projection: str, lens: str):
     test = test_each_gaussian_alone_covers_all_its_pixels.hypothesis.inner_test
     for seed in range(20 if size[0] < 100 else 2):
@@ -109,8 +98,8 @@ CAMERAS_OF_ANY_SIZE = {
 
 @pytest.mark.parametrize("width", [72, 1000, 4096, 16384])
 @pytest.mark.parametrize("side", ["left", "right", "above", "below"])
-@pytest.mark.parametrize(("projection", "lens"), [setup for setup in SETUPS if "fisheye" not in setup])
-@needs_native
+@pytest.mark.parametrize(("projection", "lens"), [setup for setup in cases.SETUPS if "fisheye" not in setup])
+@cases.needs_native
 def test_the_outermost_pixel_of_a_footprint_is_drawn(side: str, width: int, projection: str, lens: str):
     """Round footprints centred on a row or column of pixels, and so opaque that alpha is 1.003/255 four pixels away."""
     generator = torch.Generator().manual_seed(width)
@@ -139,13 +128,13 @@ def test_the_outermost_pixel_of_a_footprint_is_drawn(side: str, width: int, proj
         opacities < 0.95
     )  # toward the poles four pixels are no distance, at the rim of a pinhole image a long one
     assert usable.double().mean() > 0.5
-    single = chosen(Gaussians(round_ones.means, quats, round_ones.scales, opacities, round_ones.colors), usable)
-    column, end, _, row, row_end = pixel_boxes(single, camera, options, identity_pose()).unbind(1)
+    single = cases.chosen(Gaussians(round_ones.means, quats, round_ones.scales, opacities, round_ones.colors), usable)
+    column, end, _, row, row_end = pixel_boxes(single, camera, options, cases.identity_pose()).unbind(1)
     u, v = target[usable].unbind(1)
     assert ((column <= u) & (u < end) & (row <= v) & (v < row_end)).all()
 
 
-@each_engine
+@cases.each_engine
 def test_published_bounds_lose_contributions(backend: str, dtype: torch.dtype):
     """A square of three standard deviations cuts alphas up to 0.011 o, and a footprint ends at the seam."""
     scale = 0.25
@@ -159,7 +148,7 @@ def test_published_bounds_lose_contributions(backend: str, dtype: torch.dtype):
     width, height = 256, 128
     alpha = alphas(broad.to(torch.float64), Panorama(width, height), RenderOptions(wrap=False))[0].view(height, width)
     sigma = width / (2 * math.pi) * scale
-    rendering = draw(broad, width, height, backend=backend, dtype=dtype, options=RELEASED)
+    rendering = cases.draw(broad, width, height, backend=backend, dtype=dtype, options=cases.RELEASED)
     lost = (rendering.transmittance == 1) & (alpha >= ALPHA_MIN * 1.001)
     assert lost.any() and alpha[lost].max() <= 0.0112 * 0.95
     column = torch.arange(width) + 0.5 - width / 2
@@ -167,12 +156,12 @@ def test_published_bounds_lose_contributions(backend: str, dtype: torch.dtype):
 
 
 @pytest.mark.parametrize("bounds", ["exact", "square"])
-@each_engine
+@cases.each_engine
 def test_without_wrap_footprints_end_at_the_seam(bounds: str, backend: str, dtype: torch.dtype):
-    gaussians = gaussians_of("seam", 20, torch.Generator().manual_seed(3))
+    gaussians = cases.gaussians_of("seam", 20, torch.Generator().manual_seed(3))
     left = gaussians.means[:, 0] < 0  # longitudes just above -180 degrees: the left border
     options = RenderOptions(wrap=False, bounds=bounds)
     for side, columns in ((left, slice(64, None)), (~left, slice(None, 64))):
-        rendering = draw(chosen(gaussians, side), 128, 64, backend=backend, dtype=dtype, options=options)
+        rendering = cases.draw(cases.chosen(gaussians, side), 128, 64, backend=backend, dtype=dtype, options=options)
         assert (rendering.transmittance < 1).any()
         assert (rendering.transmittance[:, columns] == 1).all()

@@ -8,23 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import render_cases as cases
 from support.definition import MARGIN, alphas
 from support.native_tiles import NativeTiles, projected
-from support.render_cases import (
-    KINDS,
-    ODD_SIZES,
-    OUTPUTS,
-    RELEASED,
-    SETUPS,
-    camera_of,
-    differentiated,
-    each_setup,
-    gaussians_of,
-    identity_pose,
-    mixture,
-    needs_native,
-    random_pose,
-)
 
 from padgs.geometry.camera import Panorama
 from padgs.render import RenderOptions
@@ -32,17 +18,17 @@ from padgs.render.backends.cpu import TILE
 from padgs.render.contract import ALPHA_MIN
 
 few = settings(max_examples=10, deadline=None, derandomize=True, database=None)
-SIZES = st.sampled_from([*ODD_SIZES, (200, 90), (256, 128), (1, 1), (90, 200)])
+SIZES = st.sampled_from([*cases.ODD_SIZES, (200, 90), (256, 128), (1, 1), (90, 200)])
 
 
-@each_setup
-@needs_native
+@cases.each_setup
+@cases.needs_native
 @few
-@given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**31), size=SIZES, wrap=st.booleans())
+@given(kind=st.sampled_from(cases.KINDS), seed=st.integers(0, 2**31), size=SIZES, wrap=st.booleans())
 def test_tiles_contain_every_pixel_once(kind, seed, size, wrap, projection: str, lens: str):
-    gaussians = gaussians_of(kind, 12, torch.Generator().manual_seed(seed))
-    camera, options = camera_of(lens, *size), RenderOptions(projection, wrap=wrap or projection != "erp")
-    tiles = NativeTiles(gaussians, camera, options, identity_pose())
+    gaussians = cases.gaussians_of(kind, 12, torch.Generator().manual_seed(seed))
+    camera, options = cases.camera_of(lens, *size), RenderOptions(projection, wrap=wrap or projection != "erp")
+    tiles = NativeTiles(gaussians, camera, options, cases.identity_pose())
     accepted = alphas(gaussians, camera, options) >= ALPHA_MIN * (1 + MARGIN)
     for index in range(len(gaussians)):
         times = tiles.times_listed(index, camera)
@@ -58,44 +44,44 @@ def test_tiles_contain_every_pixel_once(kind, seed, size, wrap, projection: str,
     assert torch.equal(owner[tiles.slot], tiles.gaussian)
 
 
-@needs_native
+@cases.needs_native
 @pytest.mark.parametrize(("width", "height"), [(2048, 1024), (1000, 500), (72, 36), (300, 600), (16, 400)])
 def test_tiles_cover_the_same_angle_in_every_row(width: int, height: int):
-    gaussians = gaussians_of("ordinary", 1, torch.Generator().manual_seed(1))
-    level = projected(gaussians, Panorama(width, height), RenderOptions("ray"), identity_pose()).level
+    gaussians = cases.gaussians_of("ordinary", 1, torch.Generator().manual_seed(1))
+    level = projected(gaussians, Panorama(width, height), RenderOptions("ray"), cases.identity_pose()).level
     for row, found in enumerate(level.tolist()):
         latitude = ((row + 0.5) * TILE / height - 0.5) * math.pi
         wanted = round(math.log2(1 / max(math.cos(latitude), 1e-3)))
         assert 0 <= found <= 4 and (found == min(wanted, 4) or (TILE << found + 1) > -(-width // TILE) * TILE)
     for projection, lens in (("pinhole", "pinhole"), ("ray", "pinhole"), ("ray", "fisheye")):
-        camera = camera_of(lens, width, height)
-        assert not projected(gaussians, camera, RenderOptions(projection), identity_pose()).level.any()
+        camera = cases.camera_of(lens, width, height)
+        assert not projected(gaussians, camera, RenderOptions(projection), cases.identity_pose()).level.any()
 
 
-@needs_native
+@cases.needs_native
 def test_exact_bounds_need_fewer_tiles():
     """Bounds depend on opacity and both axes, and tiles widen towards the poles."""
-    gaussians = mixture(200, torch.Generator().manual_seed(5), ("ordinary", "polar"))
-    published = NativeTiles(gaussians, Panorama(512, 256), RELEASED, identity_pose()).count
+    gaussians = cases.mixture(200, torch.Generator().manual_seed(5), ("ordinary", "polar"))
+    published = NativeTiles(gaussians, Panorama(512, 256), cases.RELEASED, cases.identity_pose()).count
     for projection in ("erp", "tangent", "ray"):
-        ours = NativeTiles(gaussians, Panorama(512, 256), RenderOptions(projection), identity_pose())
+        ours = NativeTiles(gaussians, Panorama(512, 256), RenderOptions(projection), cases.identity_pose())
         assert ours.count < 0.45 * published
 
 
-@needs_native
+@cases.needs_native
 def test_tile_count_of_a_small_gaussian_by_latitude():
     """It spans many columns near the poles; wide tiles keep the count below twice that of the horizon."""
     counts = []
     for latitude in (0, 45, 70, 80, 85):
         generator = torch.Generator().manual_seed(3)
-        gaussians = gaussians_of("ordinary", 300, generator)
+        gaussians = cases.gaussians_of("ordinary", 300, generator)
         angle = math.radians(latitude) * torch.ones(300, dtype=torch.float64)
         longitude = 2 * math.pi * torch.rand(300, generator=generator, dtype=torch.float64)
         flat = torch.cos(angle)
         means = torch.stack((flat * torch.sin(longitude), torch.sin(angle), flat * torch.cos(longitude)), dim=-1)
         scales = torch.full((300, 3), math.radians(0.7))  # four pixels at this size
         moved = type(gaussians)(means, gaussians.quats, scales, gaussians.opacities, gaussians.colors)
-        tiles = NativeTiles(moved, Panorama(2048, 1024), RenderOptions("ray"), identity_pose())
+        tiles = NativeTiles(moved, Panorama(2048, 1024), RenderOptions("ray"), cases.identity_pose())
         counts.append(tiles.count / 300)
     assert max(counts) < 2 * counts[0] and counts[0] < 7, counts
 
@@ -103,25 +89,27 @@ def test_tile_count_of_a_small_gaussian_by_latitude():
 @pytest.mark.parametrize(
     ("projection", "lens", "more"),
     [
-        *((*setup, {}) for setup in SETUPS),
+        *((*setup, {}) for setup in cases.SETUPS),
         ("erp", "panorama", {"wrap": False}),
         ("ray", "panorama", {"blending": "hybrid", "core_size": 4}),
     ],
 )
-@needs_native
+@cases.needs_native
 def test_strips_render_and_differentiate_the_same(projection: str, lens: str, more: dict):
     generator = torch.Generator().manual_seed(12)
-    gaussians = mixture(20, generator, ("ordinary", "polar", "seam", "needle"))
-    engine = {"pose": random_pose(generator, shift=0.1), "backend": "cpu", "dtype": torch.float32}
-    weights, camera = torch.randn(90, 200, 5, generator=generator), camera_of(lens, 200, 90)
+    gaussians = cases.mixture(20, generator, ("ordinary", "polar", "seam", "needle"))
+    engine = {"pose": cases.random_pose(generator, shift=0.1), "backend": "cpu", "dtype": torch.float32}
+    weights, camera = torch.randn(90, 200, 5, generator=generator), cases.camera_of(lens, 200, 90)
     (whole, gradients), *others = (
-        differentiated(gaussians, camera, RenderOptions(projection, max_instances=limit, **more), weights, **engine)
+        cases.differentiated(
+            gaussians, camera, RenderOptions(projection, max_instances=limit, **more), weights, **engine
+        )
         for limit in (1 << 26, 200, 1)
     )
     assert whole.counters["instances"] > 250
     for rendering, strip_gradients in others:
         assert rendering.counters == whole.counters
-        for name in OUTPUTS:
+        for name in cases.OUTPUTS:
             assert torch.equal(getattr(rendering, name), getattr(whole, name)), name
         for name, gradient in gradients.items():
             if name == "rays":  # strips add to it one after the other
@@ -130,11 +118,13 @@ def test_strips_render_and_differentiate_the_same(projection: str, lens: str, mo
                 assert torch.equal(strip_gradients[name], gradient), name
 
 
-@needs_native
+@cases.needs_native
 def test_strips_respect_max_instances():
-    gaussians = mixture(100, torch.Generator().manual_seed(13), ("ordinary", "polar"))
+    gaussians = cases.mixture(100, torch.Generator().manual_seed(13), ("ordinary", "polar"))
     for limit in (1, 100, 400, 1000):
-        lists = projected(gaussians, Panorama(256, 128), RenderOptions("ray", max_instances=limit), identity_pose())
+        lists = projected(
+            gaussians, Panorama(256, 128), RenderOptions("ray", max_instances=limit), cases.identity_pose()
+        )
         strips = list(lists.strips())
         assert sum(len(strip.instances) for strip in strips) == lists.instances > 1000
         assert [strip.grid.first_row for strip in strips] == [0, *(strip.grid.end_row for strip in strips[:-1])]

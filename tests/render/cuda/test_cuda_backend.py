@@ -12,17 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support import cuda_engine
-from support.render_cases import (
-    INPUTS,
-    blended,
-    camera_of,
-    gaussians_of,
-    leaves,
-    mixture,
-    random_pose,
-    row_error,
-    view_of,
-)
+from support import render_cases as cases
 from torch import Tensor
 
 from padgs import render as package
@@ -49,17 +39,17 @@ def drawn(
 ) -> tuple[Rendering, dict[str, Tensor]]:
     """Return a rendering in a random pose, and gradients of randomly weighted outputs."""
     generator = torch.Generator().manual_seed(5)
-    inputs = leaves(gaussians, torch.float32)
-    pose = random_pose(generator, shift=0.1).float().requires_grad_()
-    rendering = render(inputs, view_of(camera_of(lens, *size), pose), options, backend=backend)
+    inputs = cases.leaves(gaussians, torch.float32)
+    pose = cases.random_pose(generator, shift=0.1).float().requires_grad_()
+    rendering = render(inputs, cases.view_of(cases.camera_of(lens, *size), pose), options, backend=backend)
     weighed = (getattr(rendering, name) for name in outputs)
     sum((out * torch.randn(out.shape, generator=generator, dtype=weights)).sum() for out in weighed).backward()
-    return rendering, {**{name: getattr(inputs, name).grad for name in INPUTS}, "pose": pose.grad}
+    return rendering, {**{name: getattr(inputs, name).grad for name in cases.INPUTS}, "pose": pose.grad}
 
 
 def crowd(count: int, generator: torch.Generator) -> Gaussians:
     """Return faint Gaussians whose lists are longer than the batches and buckets of kernels."""
-    gaussians = mixture(count // 4, generator, ("ordinary", "polar", "pole", "seam"))
+    gaussians = cases.mixture(count // 4, generator, ("ordinary", "polar", "pole", "seam"))
     return Gaussians(**{**vars(gaussians), "opacities": 0.1 * gaussians.opacities})
 
 
@@ -67,7 +57,7 @@ def crowd(count: int, generator: torch.Generator) -> Gaussians:
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
 def test_long_lists(projection: str, blending: str, generator: torch.Generator):
     gaussians = crowd(1200, generator)
-    options = RenderOptions(projection, low_pass_kind="angular", **blended(blending, 4))
+    options = RenderOptions(projection, low_pass_kind="angular", **cases.blended(blending, 4))
     expected, expected_gradients = drawn(gaussians, (72, 36), options, backend="cpu")
     actual, gradients = drawn(gaussians, (72, 36), options)
     assert actual.counters["instances"] > 8 * 256
@@ -76,14 +66,14 @@ def test_long_lists(projection: str, blending: str, generator: torch.Generator):
     assert (actual.image - expected.image).abs().max() < flipped
     for name, gradient in expected_gradients.items():
         if name != "pose":
-            assert row_error(gradients[name], gradient) < 0.05, name
+            assert cases.row_error(gradients[name], gradient) < 0.05, name
             assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
 
 
 def test_leave_one_out_of_long_lists_is_deterministic(generator, monkeypatch):
     gaussians, options = crowd(1200, generator), RenderOptions("ray", low_pass=0.1)
     gaussians = Gaussians(**{name: tensor.float() for name, tensor in vars(gaussians).items()})
-    view, target, weight = view_of(camera_of("panorama", 72, 36)), torch.rand(36, 72, 3), torch.rand(36, 72)
+    view, target, weight = cases.view_of(cases.camera_of("panorama", 72, 36)), torch.rand(36, 72, 3), torch.rand(36, 72)
     expected, actual = (
         leave_one_out(gaussians, view, target, weight, options, backend=backend) for backend in ("cpu", "cuda")
     )
@@ -100,7 +90,7 @@ def test_leave_one_out_of_long_lists_is_deterministic(generator, monkeypatch):
 @pytest.mark.parametrize("projection", ["erp", "ray"])
 def test_core_sizes(projection: str, generator: torch.Generator):
     """Core sizes around those that kernels are compiled for; some pixels have more fragments."""
-    gaussians = gaussians_of("ordinary", 300, generator)
+    gaussians = cases.gaussians_of("ordinary", 300, generator)
     ahead = gaussians.means.abs() * torch.tensor([0.1, 0.1, 1.0]) + torch.tensor([0.0, 0.0, 2.0])
     broad = {"scales": 0.4 + gaussians.scales, "opacities": torch.full((300,), 0.08, dtype=torch.float64)}
     gaussians, images = Gaussians(**{**vars(gaussians), "means": ahead.float().double(), **broad}), []
@@ -117,7 +107,7 @@ def test_core_sizes(projection: str, generator: torch.Generator):
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 def test_strips_change_nothing(blending: str, generator: torch.Generator):
-    gaussians, options = crowd(200, generator), RenderOptions(**blended(blending, 3))
+    gaussians, options = crowd(200, generator), RenderOptions(**cases.blended(blending, 3))
     whole, whole_gradients = drawn(gaussians, (131, 77), options)
     parts, parts_gradients = drawn(gaussians, (131, 77), replace(options, max_instances=300))
     for name in ("image", "transmittance", "depth", "visible"):
@@ -132,7 +122,7 @@ def test_strips_change_nothing(blending: str, generator: torch.Generator):
 def test_results_do_not_depend_on_which_thread_runs_first(
     projection, lens, blending, generator, monkeypatch: pytest.MonkeyPatch
 ):
-    gaussians, options = crowd(400, generator), RenderOptions(projection, **blended(blending, 3))
+    gaussians, options = crowd(400, generator), RenderOptions(projection, **cases.blended(blending, 3))
     usual = drawn(gaussians, (40, 20), options, lens=lens)
     for seed in range(3):  # of the order in which the emulation runs threads; a GPU just repeats
         monkeypatch.setenv("PADGS_EMULATION_SEED", str(seed))
@@ -195,7 +185,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch, function: str, read) -> list:
 def test_capacity_of_the_last_image_changes_nothing(
     blending: str, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
 ):
-    gaussians, options = crowd(200, generator), RenderOptions("ray", **blended(blending, 3))
+    gaussians, options = crowd(200, generator), RenderOptions("ray", **cases.blended(blending, 3))
     capacities = recorded(monkeypatch, "padgs_cuda_bin", lambda arguments: arguments.sort.count)
     usual = drawn(gaussians, (72, 36), options)
     count = usual[0].counters["instances"]
@@ -215,7 +205,10 @@ def test_capacity_of_the_last_image_changes_nothing(
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
 def test_counters_equal_those_of_the_cpu(lens: str, blending: str, generator: torch.Generator):
-    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions("ray", **blended(blending, 2))
+    gaussians, options = (
+        cases.gaussians_of("ordinary", 40, generator),
+        RenderOptions("ray", **cases.blended(blending, 2)),
+    )
     expected, actual = (drawn(gaussians, (72, 36), options, backend=name, lens=lens)[0] for name in ("cpu", "cuda"))
     assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
     for name in ("gaussians", "visible", "contributing"):
@@ -228,8 +221,8 @@ def test_counters_equal_those_of_the_cpu(lens: str, blending: str, generator: to
 
 def test_cores_are_kept_only_with_gradients(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     kept = recorded(monkeypatch, "padgs_cuda_blend", lambda a: a.core is not None and a.tails is not None)
-    inputs = leaves(gaussians_of("ordinary", 5, generator), torch.float32)
-    view, options = view_of(camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid")
+    inputs = cases.leaves(cases.gaussians_of("ordinary", 5, generator), torch.float32)
+    view, options = cases.view_of(cases.camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid")
     images = [render(inputs, view, options, backend="cuda").image]
     with torch.no_grad():
         images.append(render(inputs, view, options, backend="cuda").image)
@@ -310,7 +303,7 @@ def versions_of(driver: int, built_with: int) -> SimpleNamespace:
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
 def test_the_default_dtype_of_torch_changes_nothing(lens: str, blending: str, generator: torch.Generator):
-    gaussians, options = crowd(40, generator), RenderOptions("ray", **blended(blending, 3))
+    gaussians, options = crowd(40, generator), RenderOptions("ray", **cases.blended(blending, 3))
     native_backend._formula_rays.cache_clear()
     usual = drawn(gaussians, (40, 20), options, lens=lens)
     native_backend._formula_rays.cache_clear()
