@@ -1,7 +1,5 @@
 """EgoNeRF (Choi et al. 2023) as a method: a radiance field on spherical grids, rendered by sampling rays."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import torch

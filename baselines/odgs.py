@@ -4,8 +4,6 @@ This footprint equals the one through the Jacobian of the panorama (tests/baseli
 with projection `erp`. Its densification has half the threshold of 3DGS.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

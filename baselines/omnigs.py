@@ -4,8 +4,6 @@ It is also the first row of the ablation (Table 3). conf/method/omnigs_release.y
 code.
 """
 
-from __future__ import annotations
-
 from padgs.methods.splats.method import SplatMethod
 
 

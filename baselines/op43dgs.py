@@ -4,8 +4,6 @@ conf/method/op43dgs_release.yaml has the deviations of its released code: bounds
 Gaussian in world units, a low-pass that does not depend on the image size, and the memory that both exhaust.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -5,8 +5,6 @@ sphere once, like an iteration of a panoramic method. Crops look along the verti
 vertical axis of the panorama; they overlap, so that every direction is inside some crop.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import nullcontext

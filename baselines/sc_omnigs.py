@@ -4,8 +4,6 @@ A preset of `train.poses` and `train.lens`, and a penalty. Implemented after the
 the paper and without code, which is not public. docs/methods.md lists what is stated there and what is inferred.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ A preset of `train.lens`. Implemented after the abstract, without the paper and 
 docs/methods.md lists what is stated there and what is inferred.
 """
 
-from __future__ import annotations
-
 from padgs.methods.splats.method import SplatMethod
 from padgs.render import RenderConfig
 from padgs.training.options import TrainOptions

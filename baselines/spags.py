@@ -4,8 +4,6 @@ Also its own: a Gaussian that reaches the near sphere is culled as a whole, a 3D
 (variance 0.2 (r / f)^2), and densification by the gradient in space. spags_sorted blends in the order of the means.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from padgs.methods.splats.method import SplatMethod, SplatOptions

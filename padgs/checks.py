@@ -3,8 +3,6 @@
 A registry is a dict of name -> "package.module:attribute"; nothing is imported before it is asked for.
 """
 
-from __future__ import annotations
-
 import difflib
 import sys
 import types

@@ -4,8 +4,6 @@ Wall time is how long the user waits, CPU time is what the work costs. On a shar
 smallest of several repeats is the most reliable.
 """
 
-from __future__ import annotations
-
 import datetime
 import os
 import platform

@@ -3,8 +3,6 @@
 The file is written last and atomically: if it exists, the run is finished. A failed run has one too, with a status.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -6,8 +6,6 @@ nearest point. A block trains on its own cameras and on the margin: other camera
 belongs to it. A merged model has of each run the Gaussians that lie in its block.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

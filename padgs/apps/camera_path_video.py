@@ -5,8 +5,6 @@ boxes, each 4 bytes of size, 4 of type, and content. Appending to the track move
 because the index (`moov`) is the last box.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Iterator, Sequence

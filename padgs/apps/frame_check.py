@@ -1,7 +1,5 @@
 """World of a file of Gaussians: transforms that users state, and a check that the file's world is the scene's."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence

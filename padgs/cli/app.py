@@ -1,7 +1,5 @@
 """Entry point of `padgs`; imports slow modules only once it answers Ctrl-C."""
 
-from __future__ import annotations
-
 from padgs.runs.interrupt import ending_by_signals
 
 

@@ -1,7 +1,5 @@
 """`padgs bench`: the time of each stage of training, beside the least time at this machine's ceilings."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

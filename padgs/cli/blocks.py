@@ -1,7 +1,5 @@
 """`padgs split` and `padgs merge`: a large capture as blocks that are trained one by one."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """The commands of `padgs`. A command imports slow modules when it is called."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

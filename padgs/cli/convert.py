@@ -1,7 +1,5 @@
 """`padgs convert`: write a data set in another format."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

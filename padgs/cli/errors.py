@@ -1,7 +1,5 @@
 """Parts of all commands: errors as one line, text for the terminal, arguments that name a run."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """`padgs export`: a run as a file that other programs open."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`padgs smallest` and `padgs track`: searches from finished runs, and their copies in mlflow."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

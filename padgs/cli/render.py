@@ -1,7 +1,5 @@
 """`padgs render`: a video, or images, along a camera path through a run."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`padgs report`: read finished runs, make tables, charts and the page, write them down."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

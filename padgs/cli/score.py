@@ -1,7 +1,5 @@
 """`padgs score`: Gaussians or renders of another program, scored like a run."""
 
-from __future__ import annotations
-
 import sys
 from typing import Annotated
 

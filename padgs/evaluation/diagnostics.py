@@ -8,8 +8,6 @@ scene has more detail at the horizon, it is negative for a method that treats al
 compared with the gap of an oracle: the ground truth, blurred equally in all directions to the WS-PSNR of the render.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Evaluation of renders of test views under a protocol."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 

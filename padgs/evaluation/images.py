@@ -1,7 +1,5 @@
 """Images to look at: ground truth, render and error side by side, and depth as colours."""
 
-from __future__ import annotations
-
 import numpy as np
 from torch import Tensor
 

@@ -9,8 +9,6 @@ with known checksums and read by an unpickler that builds only NumPy arrays. Wit
 `lpips` of the authors, whose torchvision downloads the image networks once.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import importlib.util

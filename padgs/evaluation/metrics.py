@@ -8,8 +8,6 @@ change no metric. (Filling masked pixels of both images with 0 instead would add
 Names: `ws_` means weighted by solid angle, M = cos(latitude) of each row (Eq. 17).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

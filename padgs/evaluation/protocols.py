@@ -6,8 +6,6 @@ All protocols compare 8-bit images: the render is clamped to [0, 1] and rounded 
 (see `padgs.evaluation.metrics`). The released evaluation has no masks; without masks, `paper` reproduces its numbers.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Score a trained method on the test views under protocols, and time its rendering."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ Panorama and pinhole are formulas; any other camera (fisheye, cylinder, calibrat
 and pinholes are equal if their numbers are.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ An ERP pixel at latitude t covers a solid angle proportional to cos(t): the imag
 1 at the poles. Latitude is measured in the *camera* frame unless another axis is given.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ Functions of degree l are ordered m = -l .. l; odd m have a minus sign (Condon-S
 unit sphere.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

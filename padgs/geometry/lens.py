@@ -3,8 +3,6 @@
 Directions are unit vectors in the camera frame (x right, y down, z forward), angles are radians.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

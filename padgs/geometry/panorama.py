@@ -7,8 +7,6 @@ This is COLMAP's EQUIRECTANGULAR camera. The paper's Eq. 6 is the same map with 
 (x, y, z) of the paper = (-z, x, y) here.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

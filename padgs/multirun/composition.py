@@ -1,7 +1,5 @@
 """Compose configurations with Hydra, from files, tables and everything that the program knows by name."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -6,8 +6,6 @@ of its `result.json`, and the names, sizes and times of its data files. If anyth
 run folder is looked up.
 """
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import json

@@ -4,8 +4,6 @@
 which asks all jobs to stop. Nothing else couples a job to its parent, so it runs on any machine that sees the folder.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

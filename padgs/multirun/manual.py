@@ -1,7 +1,5 @@
 """`padgs-run --help`: every key with its default and its meaning, the comment of its field."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import shutil

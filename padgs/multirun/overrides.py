@@ -1,7 +1,5 @@
 """Translate command lines into overrides for Hydra, and expand a sweep into the overrides of its jobs."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import math

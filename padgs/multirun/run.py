@@ -1,7 +1,5 @@
 """`padgs-run`: one run, or a multirun of many, composed by Hydra from `conf/`."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """Jobs in Slurm's queue: wait until they have left it, and remove those that have not begun."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import time

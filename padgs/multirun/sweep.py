@@ -4,8 +4,6 @@ In place of Hydra's sweepers: finished jobs are skipped without being composed, 
 line sums up all jobs while they run, and Ctrl-C lets running jobs write their checkpoints.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shlex
 import shutil

@@ -3,8 +3,6 @@
 Names are those of namespace padgs in `csrc/abi.h` unless a docstring says otherwise.
 """
 
-from __future__ import annotations
-
 import ctypes
 
 from torch import Tensor

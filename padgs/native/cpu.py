@@ -1,7 +1,5 @@
 """libpadgs_cpu: tiles, SIMD, OpenMP (`csrc/cpu`). Importing this module loads nothing."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 

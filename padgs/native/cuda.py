@@ -4,8 +4,6 @@ The library contains kernels and its own CUDA runtime. It takes pointers to memo
 allocates nothing and never waits.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
 """Find and load a native library, refuse one of another version, and time its calls on request."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import os

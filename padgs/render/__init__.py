@@ -3,8 +3,6 @@
 Backends are the entries of `BACKENDS`; each is a `padgs.render.contract.Backend`. Backend torch is the definition.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, fields
 from functools import cache

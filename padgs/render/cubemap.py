@@ -6,8 +6,6 @@ on the order. Projection `ray` gives the same image on all faces, up to interpol
 onto the plane of each face, so its footprint changes from face to face: the seams of published cubemap baselines.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache

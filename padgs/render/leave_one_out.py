@@ -9,8 +9,6 @@ Other importance scores (opacity, size, contribution, curvature of the loss) mea
 measures the cost of its absence. A negative score is a Gaussian that increases the error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

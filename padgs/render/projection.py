@@ -16,8 +16,6 @@ Planar footprints are 2D Gaussians in pixels, by the Jacobian of the camera at t
 projection of OmniGS, ODGS and PaD-GS; pinhole that of 3D Gaussian splatting.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ tangent: the Gaussian flattened onto the tangent plane of the sphere at its mean
 ray: the largest value of the 3D Gaussian along the ray (SPaGS).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import pi
 

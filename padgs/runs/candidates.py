@@ -3,8 +3,6 @@
 The control keeps all Gaussians, and is refined likewise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

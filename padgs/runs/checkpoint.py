@@ -5,8 +5,6 @@ The tensors are written first, under a new name; replacing `state.json` then swi
 process is killed or the disk is full, the folder still holds one complete checkpoint.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The configuration of a run. Its keys are the fields of dataclasses; the files in `conf/` only override defaults."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Iterator, Mapping

@@ -10,8 +10,6 @@ So it is compared with the control, which is refined likewise and keeps all Gaus
 smallest candidate that is not inferior to the control.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ Only the process that the user started mirrors the runs of a multirun. mlflow ta
 database, so it is imported when the first run has ended.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import time

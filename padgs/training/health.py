@@ -1,7 +1,5 @@
 """Health of a training: failures, the monitor that ends failing runs, and early stopping."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence

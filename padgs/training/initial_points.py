@@ -1,7 +1,5 @@
 """Checks and spacing of the initial points, and the extent of the cameras."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The training loop: render a training view, compare it with its image, back-propagate, step Adam, densify."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext

@@ -5,8 +5,6 @@ W = row weight M (Eq. 17) x mask. Pixels that a mask hides have weight 0. SSIM w
 both images, so that no gradient comes from hidden pixels.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Parameters (`nn.Parameter`) keep their identity; their `.data` and Adam moments 
 graph over the old rows may be alive when the next one is built.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Budget and options of a training."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """3DGS on cube faces and on crops."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

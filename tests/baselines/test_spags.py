@@ -1,7 +1,5 @@
 """SPaGS: what sets it apart. Order along the ray, bounds that lose nothing and the cull are tested in tests/render."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

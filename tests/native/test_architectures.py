@@ -1,7 +1,5 @@
 """Architectures of libpadgs_cuda, chosen by CMake from the output of nvcc and nvidia-smi; both are faked here."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

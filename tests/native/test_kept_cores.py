@@ -1,7 +1,5 @@
 """Cores that hybrid blending keeps for its backward pass."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

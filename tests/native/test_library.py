@@ -1,7 +1,5 @@
 """Selection, loading and absence of the native library."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import subprocess

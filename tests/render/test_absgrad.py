@@ -1,7 +1,5 @@
 """The absolute positional gradient against its definition, in every backend."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Equivalent descriptions of a camera: formula, ray table, or another pose."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from support import render_cases as cases

@@ -1,7 +1,5 @@
 """Invalid input raises an error that names the tensor, the rule and the way out; no input crashes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Cubemaps: geometry, interpolation, seams, gradients."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Errors of footprints against the ray response: known numbers, laws, and the table in the docs."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shape and mass of single footprints against the exact ray response, from the equator to the pole."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -4,8 +4,6 @@ The cases, made by another program in float64, lie beside the checkout. They say
 that rounding may take it: pixels that are not `stable`, `close_pairs`, gradients that are not `valid`.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Hybrid blending: its weights, and values, derivatives and order in every backend and projection."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

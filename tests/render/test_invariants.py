@@ -1,7 +1,5 @@
 """Invariances of every renderer: position, direction, unit of length, order of the input."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

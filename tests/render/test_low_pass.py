@@ -1,7 +1,5 @@
 """Low-pass kinds in every projection: width, opacity and gradients."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """near_cull=ellipsoid culls Gaussians that reach the near plane, and changes nothing else."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

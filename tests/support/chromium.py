@@ -1,7 +1,5 @@
 """A page in this machine's Chromium, which playwright drives. What it complains of and asks for is kept."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Iterator

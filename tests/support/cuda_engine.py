@@ -3,8 +3,6 @@
 Importing this module arranges it for the whole process. On a GPU, tensors of a test stay on the CPU and take a trip.
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import functools

@@ -4,8 +4,6 @@ Everything is float64 and happens in the camera frame: the pose is the identity.
 projection was published with.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ Nothing here uses padgs: images are ray-cast, and files follow the formats' own 
 are not repeated. The world is a coloured box without symmetries; cameras inside are tilted, which reveals wrong axes.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Pixel boxes and tile lists of the native library as tensors."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

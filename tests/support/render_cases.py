@@ -1,7 +1,5 @@
 """Difficult Gaussians, cameras, poses, engines (backend, dtype), and comparisons for tests of rendering."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -20,8 +20,6 @@ sizes       name -> one workload:
   peak_bytes  memory at the peak of frames and of training: of the process, or of torch's allocator on a GPU
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Iterator

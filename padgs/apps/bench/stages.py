@@ -4,8 +4,6 @@ On the CPU stages nest, and a stage is charged only while no inner one runs, so 
 iteration. `padgs.training.loop` has the outer stages; native calls are inner ones.
 """
 
-from __future__ import annotations
-
 import copy
 import re
 import time

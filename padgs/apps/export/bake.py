@@ -5,8 +5,6 @@ Opacity and covariance are weighted means; colours are spherical harmonics fitte
 refined by distillation: it is trained on renders of the anchors, without photographs and test views.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Conversion of runs to explicit Gaussians, and similarity transforms of explicit Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace

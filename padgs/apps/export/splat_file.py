@@ -6,8 +6,6 @@ float32: the parameters of `Splats`. Harmonics have the degree of the model; pro
 option (`--sh_degree` of 3DGS). Padding with zeros would make small files three times as large.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Groups of controls of a page: a crop box with handles, and a film of views."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Callable

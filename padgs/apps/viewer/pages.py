@@ -1,7 +1,5 @@
 """Pages of the viewer: controls and a render thread for each browser, and updates from training."""
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings

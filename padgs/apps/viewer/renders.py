@@ -1,7 +1,5 @@
 """Renders of a run for the viewer: colours, depth or error, cropped, from any pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

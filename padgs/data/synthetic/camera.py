@@ -4,8 +4,6 @@ Poses are in metres. The sub-pixel jitter of a pixel depends on its row only: ro
 the vertical shifts the image exactly.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

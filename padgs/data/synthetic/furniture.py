@@ -1,7 +1,5 @@
 """Furniture and loose objects of synthetic scenes, as lists of shapes. Positions in metres, z = 0 is the floor."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

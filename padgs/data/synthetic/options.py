@@ -1,7 +1,5 @@
 """Options of the synthetic scenes. They determine every pixel, pose and point, and are the cache key."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 World frame: x, y horizontal, z up, metres. A heading of 0 looks along +x; positive headings turn left.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

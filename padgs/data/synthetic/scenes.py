@@ -3,8 +3,6 @@
 `outdoor` and `room_chain` (any number of rooms in a row) are described in Python.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cache

@@ -9,8 +9,6 @@ surrounds the camera), and two functions. `hit` returns distances [n] along unit
 depth). `surface` returns normals, texture coordinates and faces of points [3, n] on the shape.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

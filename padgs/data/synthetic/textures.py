@@ -4,8 +4,6 @@ A texture maps uv [2, n] (metres from the centre of a face, u to the right, v up
 Functions decorated by `texture` are called without uv, and return a texture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from typing import Any, Concatenate, ParamSpec

@@ -1,7 +1,5 @@
 """Exact ground truth of a synthetic scene: poses without noise, radial depth, object ids, and new views."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 

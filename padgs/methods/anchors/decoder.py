@@ -4,8 +4,6 @@
 precision on a GPU); `define_gaussians` is the definition. Only products of the networks have a reduced precision.
 """
 
-from __future__ import annotations
-
 import math
 from types import ModuleType
 from typing import NamedTuple

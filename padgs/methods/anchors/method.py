@@ -3,8 +3,6 @@
 Defaults are the paper as written; conf/method/padgs_release.yaml has the deviations of its released code.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

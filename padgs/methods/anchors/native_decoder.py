@@ -5,8 +5,6 @@ three networks, the rest by csrc/cuda/decode.cu. GPU, reduced precision: product
 that use them (csrc/cuda/networks*.cu), which compute hidden units again in the backward pass.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Sequence
 from typing import Any

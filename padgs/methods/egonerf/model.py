@@ -1,7 +1,5 @@
 """EgoNeRF in training: a radiance field with learning rates, and the trainer that draws random rays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass

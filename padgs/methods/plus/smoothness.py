@@ -7,8 +7,6 @@ differences are edges, where brightness mostly bends too, or surfaces that fit t
 On the CPU one native call computes value and derivative (csrc/cpu/roughness.cpp); `define_roughness` is the definition.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from typing import Any

@@ -3,8 +3,6 @@
 Numbers of points and Gaussians are multiples of `solid_angle_pixels` times `room_count`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

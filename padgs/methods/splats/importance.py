@@ -3,8 +3,6 @@
 The importance score of a row is the mean square change of the rendered training views when the row alone is removed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

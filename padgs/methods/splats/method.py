@@ -4,8 +4,6 @@ They differ in their options: densification (`padgs.methods.splats.densification
 subclass in `baselines`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Explicit Gaussians in training: parameters, learning rates and densification as one trainable model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 `padgs.methods.splats.splats.Splats` is the definition; csrc/cpu/splats.cpp and csrc/cuda/splats.cu compute the same.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from collections.abc import Callable

@@ -4,8 +4,6 @@ A nearer camera, or one with smaller pixels, would show Gaussians as needles tha
 filter keeps them as wide as the pixel filter of the training view with the finest pixel at that place makes them.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import replace

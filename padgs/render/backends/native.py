@@ -4,8 +4,6 @@ Defines the inputs with gradients, the tensors kept for the backward pass, and t
 rays. float32 only.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from abc import ABC, abstractmethod

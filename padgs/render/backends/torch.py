@@ -4,8 +4,6 @@ Pixels are processed in blocks, and blocks are computed again in the backward pa
 block holds (pixels x N) squared distances.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

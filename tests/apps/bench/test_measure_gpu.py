@@ -1,7 +1,5 @@
 """reports/measure_gpu.sh with fake programs: the order of its steps, and where it continues."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The decoder, its native pass, and reduced precision."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Positional gradients against their formulas."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

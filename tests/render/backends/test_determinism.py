@@ -1,7 +1,5 @@
 """Native results are bit-equal for any number of threads, and nearly so on any instruction set."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Gaussians at the limits of arithmetic: nothing becomes infinite or NaN, and neighbours are not harmed."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

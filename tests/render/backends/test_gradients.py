@@ -1,7 +1,5 @@
 """Derivatives against central differences: random latitudes, 89.9 degrees, across the seam; all inputs."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Values and gradients of all backends against the definition in float64."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from support import render_cases as cases

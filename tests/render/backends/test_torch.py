@@ -1,7 +1,5 @@
 """The definition: results by hand, gradients in float64, independence of the block size."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

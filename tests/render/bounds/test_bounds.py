@@ -1,7 +1,5 @@
 """Bounds lose nothing: each (pixel, Gaussian) pair with alpha >= 1/255 is rendered; by brute force."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Published bounds (instances of the released OmniGS and OP43DGS), bounds of ray tables that are nearly panoramas."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

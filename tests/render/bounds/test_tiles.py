@@ -1,7 +1,5 @@
 """Tile lists hold every pixel once, in order of depth, wide tiles near the poles; strips change nothing."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

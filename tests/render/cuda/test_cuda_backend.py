@@ -1,7 +1,5 @@
 """The GPU backend where it differs from the others: strips, long lists, scheduling, errors. On the GPU or emulated."""
 
-from __future__ import annotations
-
 import ctypes
 import warnings
 from collections.abc import Iterator

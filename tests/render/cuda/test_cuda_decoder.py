@@ -1,7 +1,5 @@
 """Decoding on the GPU against its definition: values and gradients; on the GPU or emulated."""
 
-from __future__ import annotations
-
 import functools
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """The GPU's photometric loss against its definition in float64; on the GPU or emulated."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from support import cuda_engine

@@ -1,7 +1,5 @@
 """Attributes of explicit Gaussians on the GPU, or emulated, against their definition: values and gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from support import cuda_engine

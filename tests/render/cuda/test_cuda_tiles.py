@@ -1,7 +1,5 @@
 """Tile lists and index arithmetic of the GPU backend, against loops over pixels; on the host."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 from dataclasses import replace

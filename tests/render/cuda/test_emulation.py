@@ -1,7 +1,5 @@
 """The emulated GPU detects planted faults."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import subprocess

@@ -1,7 +1,5 @@
 """Products of tensor cores, those of a GPU or emulated: fragments where PTX has them, numbers rounded as torch does."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 

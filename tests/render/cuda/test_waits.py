@@ -3,8 +3,6 @@
 Numbers that are read beside the drawing (`HostCopy`) are no wait: the device goes on with what it has.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import replace
