@@ -7,8 +7,8 @@ from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera
 from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
-from padgs.render.backends.cpu import TILE, Projected
-from padgs.render.backends.native import native_camera
+from padgs.render.backends.cpu import Projected
+from padgs.render.backends.native import TILE, native_camera
 from support.render_cases import INPUTS
 
 

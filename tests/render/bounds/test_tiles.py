@@ -12,7 +12,7 @@ from support.native_tiles import NativeTiles, projected
 
 from padgs.geometry.camera import Panorama
 from padgs.render import RenderOptions
-from padgs.render.backends.cpu import TILE
+from padgs.render.backends.native import TILE
 from padgs.render.contract import ALPHA_MIN
 
 few = settings(max_examples=10, deadline=None, derandomize=True, database=None)

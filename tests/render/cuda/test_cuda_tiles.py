@@ -16,9 +16,8 @@ from padgs.gaussians import Gaussians
 from padgs.native import cuda
 from padgs.native.abi import Inputs, Pointer, fields, pointer
 from padgs.render import RenderOptions
-from padgs.render.backends.cpu import TILE
 from padgs.render.backends.cuda import DeviceProjected, DeviceStrip
-from padgs.render.backends.native import native_camera
+from padgs.render.backends.native import TILE, native_camera
 
 pytestmark = [
     pytest.mark.skipif(cuda_engine.COMPILER is None, reason="no C++ compiler to run the arithmetic on the host"),
