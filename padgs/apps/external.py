@@ -35,6 +35,7 @@ from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import STABILITY, Render, frame_times, score
 from padgs.files import open_image
 from padgs.geometry import harmonics
+from padgs.geometry.similarity import Similarity
 from padgs.methods.plus.method import PlusMethod
 from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.method import SplatMethod
@@ -47,7 +48,6 @@ from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import initial_result, load_scene
 from padgs.runs.store import Labels, RunStore
 from padgs.scene import Scene, View
-from padgs.training.corrections import Similarity
 
 METHOD = "external"  # name in results
 SPLATS = (".ply", *(suffix for suffix in CONVERTED if suffix != ".html"))

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
 from padgs.evaluation.metrics import mean_color, ws_psnr
+from padgs.geometry.similarity import Similarity
 from padgs.render import Rendering
 from padgs.scene import Scene, View
-from padgs.training.corrections import Similarity
 
 IDENTITY = "identity"
 WIDTH, VIEWS, SEARCHED = 128, 4, 2  # of the low-resolution renders; views of the search for another world

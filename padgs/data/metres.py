@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from padgs.data.camera_paths import centers, gravity
 from padgs.data.capture import Cloud, DataError, Frame, listed
 from padgs.files import open_image
+from padgs.geometry.similarity import Similarity
 
 UNIT = "unit.json"
 UPRIGHT = 0.9  # minimal length of the mean of the cameras' up directions
@@ -48,31 +50,15 @@ class KnownLength:
             raise DataError(f"{option} is {length:g}; it must be a finite number of metres above 0")
 
 
-@dataclass(frozen=True)
-class WorldChange:
-    """Similarity of worlds: x_new = scale * rotation @ x_old + shift."""
-
-    scale: float = 1.0
-    rotation: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
-    shift: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
-
-    def frames(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
-        """Return frames with their poses in the new world."""
-        moved = []
-        for frame in frames:
-            pose = frame.cam_from_world.double().clone()
-            pose[:3, :3] = pose[:3, :3] @ self.rotation.mT
-            pose[:3, 3] = self.scale * pose[:3, 3] - pose[:3, :3] @ self.shift
-            moved.append(replace(frame, cam_from_world=pose))
-        return tuple(moved)
-
-    def cloud(self, cloud: Cloud) -> Cloud:
-        """Return points in the new world."""
-        return Cloud(self.scale * cloud.points.double() @ self.rotation.mT + self.shift, cloud.colors)
+def moved(frames: Sequence[Frame], cloud: Cloud | None, new_from_old: Similarity) -> tuple[tuple[Frame, ...], Any]:
+    """Return frames and points, if there are any, in another world."""
+    poses = (new_from_old.pose(frame.cam_from_world) for frame in frames)
+    cloud = None if cloud is None else Cloud(new_from_old(cloud.points.double()), cloud.colors)
+    return tuple(replace(frame, cam_from_world=pose) for frame, pose in zip(frames, poses, strict=True)), cloud
 
 
-def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) -> tuple[WorldChange, str] | None:
-    """Return the change to a world in metres, and a note on the scale; None if no length is known.
+def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) -> tuple[Similarity, str] | None:
+    """Return the similarity that leads to a world in metres, and a note on the scale; None if no length is known.
 
     With GPS, x is east, y north and z up, from the mean of the cameras' positions.
 
@@ -89,6 +75,12 @@ def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) 
     else:
         return None
     return change, f"lengths are in metres, {note}; before: times {change.scale:.6g}"
+
+
+def scaled(scale: float, rotation: Tensor | None = None) -> Similarity:
+    """Return the similarity with a scale, and perhaps a rotation, about the origin."""
+    zeros = torch.zeros(3, dtype=torch.float64)
+    return Similarity(scale, torch.eye(3, dtype=torch.float64) if rotation is None else rotation, zeros)
 
 
 def write_unit(folder: Path, note: str) -> None:
@@ -111,7 +103,7 @@ def _stem(name: str) -> str:
 
 def _by_distance(
     frames: Sequence[Frame], poses: Tensor, first: str, second: str, metres: float
-) -> tuple[WorldChange, str]:
+) -> tuple[Similarity, str]:
     names = {name: k for k, frame in enumerate(frames) for name in (frame.name, _stem(frame.name))}
     at = [names.get(name, names.get(_stem(name))) for name in (first, second)]  # "convert" may change the extension
     for name, index in zip((first, second), at, strict=True):
@@ -122,7 +114,7 @@ def _by_distance(
     extent = (centers(poses) - centers(poses).mean(0)).norm(dim=1).max().item()
     if distance <= 1e-6 * extent:
         raise DataError(f"--metres: {first} and {second} were taken at one place; name two cameras far apart")
-    return WorldChange(metres / distance), f"by {metres:g} m between {first} and {second}"
+    return scaled(metres / distance), f"by {metres:g} m between {first} and {second}"
 
 
 def _common_up(poses: Tensor, option: str) -> Tensor:
@@ -135,7 +127,7 @@ def _common_up(poses: Tensor, option: str) -> Tensor:
     return torch.tensor(estimate.up, dtype=torch.float64)
 
 
-def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[WorldChange, str]:
+def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[Similarity, str]:
     """Find the floor: the fullest layer of points below the cameras, under most cameras and with little below it."""
     instead = "; use --metres A B DISTANCE"
     if cloud is None:
@@ -168,10 +160,10 @@ def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[World
             f"--camera-height: the cameras' heights differ by {heights:.0%} (at most {_MAX_HEIGHTS:.0%}), so that not "
             f"all are {metres:g} m above one floor{instead}"
         )
-    return WorldChange(metres / height), f"by cameras {metres:g} m above the floor ({inside[best]} points)"
+    return scaled(metres / height), f"by cameras {metres:g} m above the floor ({inside[best]} points)"
 
 
-def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[WorldChange, str]:
+def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     """Fit heading, scale and place of the world, upright by the cameras, to east, north and up."""
     found = [(k, place) for k, frame in enumerate(frames) if (place := gps_of(frame.image)) is not None]
     instead = "; use --metres A B DISTANCE or --camera-height"
@@ -201,7 +193,7 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[WorldChange, str]:
     scale, angle = turn.abs().item(), turn.angle().item()
     c, s = math.cos(angle), math.sin(angle)
     rotation = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64) @ level
-    change = WorldChange(scale, rotation, truth.mean(0) - scale * rotation @ used.mean(0))
+    change = Similarity(scale, rotation, truth.mean(0) - scale * rotation @ used.mean(0))
     where = ", ".join(f"{value:.7g}" for value in origin)
     return change, (
         f"by GPS of {len(found)} images, {residual:.2g} m from the fit; x is east, y north, z up from latitude, "

@@ -19,6 +19,7 @@ from padgs.data.camera_paths import centers
 from padgs.gaussians import rotation_matrices
 from padgs.geometry.camera import Panorama
 from padgs.geometry.lens import AXES
+from padgs.geometry.similarity import Similarity
 from padgs.scene import Scene, View
 from padgs.training.lenses import ROUGHNESS_WEIGHT, CameraMap, DualLens
 from padgs.training.model import Model, TrainingRender
@@ -38,31 +39,6 @@ POSE_RATES = {
 }
 MAP, FISHEYES = "map", "fisheyes_"
 LENSES = (GIVEN, MAP, *(FISHEYES + axis for axis in AXES))
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """first_from_second: x_first = scale * rotation @ x_second + translation."""
-
-    scale: float
-    rotation: Tensor  # [3, 3]
-    translation: Tensor  # [3]
-
-    def __call__(self, points: Tensor) -> Tensor:
-        """Map points [..., 3] of the second world to the first."""
-        return self.scale * points @ self.rotation.mT + self.translation
-
-    def pose(self, cam_from_world: Tensor) -> Tensor:
-        """Map a pose [4, 4] of the second world to the first; float64."""
-        cam_from_world = cam_from_world.to(self.rotation)
-        pose = torch.eye(4, dtype=torch.float64, device=self.rotation.device)
-        pose[:3, :3] = cam_from_world[:3, :3] @ self.rotation.mT
-        pose[:3, 3] = self.scale * cam_from_world[:3, 3] - pose[:3, :3] @ self.translation
-        return pose
-
-    def inverse(self) -> Similarity:
-        """Return second_from_first."""
-        return Similarity(1 / self.scale, self.rotation.mT, -self.translation @ self.rotation / self.scale)
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,11 @@ import torch
 
 from padgs.clock import Lap
 from padgs.geometry.camera import Panorama, RayTable
+from padgs.geometry.similarity import Similarity
 from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
-from padgs.training.corrections import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, PoseRefinement, Similarity
+from padgs.training.corrections import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, PoseRefinement
 from padgs.training.health import is_out_of_memory, validation_folds
 from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer

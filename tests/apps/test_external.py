@@ -22,8 +22,8 @@ from padgs.apps.frame_check import _closest_points, as_numbers, composed, read_t
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
+from padgs.geometry.similarity import Similarity
 from padgs.methods.splats.splats import Splats
-from padgs.training.corrections import Similarity
 
 TURN = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
 MOVED = Similarity(1.7, TURN, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64))

@@ -15,7 +15,7 @@ from padgs.cli.commands import app
 from padgs.data import DataError
 from padgs.data.camera_paths import centers
 from padgs.data.capture import Cloud, Frame
-from padgs.data.metres import KnownLength, gps_of, local_metres, to_metres, unit_note
+from padgs.data.metres import KnownLength, gps_of, local_metres, moved, to_metres, unit_note
 from padgs.data.synthetic.paths import cam_from_world
 
 SCALE = 0.37  # world units per metre
@@ -48,13 +48,11 @@ def room(floor: bool = True, table: bool = True) -> Cloud:
 
 def scale_of(frames: tuple[Frame, ...], known: KnownLength, cloud: Cloud | None = None) -> float:
     change, note = to_metres(frames, cloud, known)
-    moved = change.frames(frames)
-    before, after = (centers(torch.stack([frame.cam_from_world for frame in some])) for some in (frames, moved))
+    there, points = moved(frames, cloud, change)
+    before, after = (centers(torch.stack([frame.cam_from_world for frame in some])) for some in (frames, there))
     factor = (after[5] - after[0]).norm() / (before[5] - before[0]).norm()
     if cloud is not None:
-        torch.testing.assert_close(
-            torch.cdist(after, change.cloud(cloud).points), factor * torch.cdist(before, cloud.points)
-        )
+        torch.testing.assert_close(torch.cdist(after, points.points), factor * torch.cdist(before, cloud.points))
     assert note.startswith("lengths are in metres, by ")
     return factor.item()
 
@@ -109,7 +107,7 @@ def test_gps_turns_the_world_to_east_and_north(tmp_path):
     change, note = to_metres(frames, None, KnownLength(gps=True))
     assert "x is east, y north, z up from latitude, longitude, altitude -33.5" in note
     _, truth = local_metres([gps_of(frame.image) for frame in frames])
-    found = centers(torch.stack([frame.cam_from_world for frame in change.frames(frames)]))
+    found = centers(torch.stack([frame.cam_from_world for frame in moved(frames, None, change)[0]]))
     torch.testing.assert_close(found, truth, atol=0.02, rtol=0)
     length = (found[11] - found[0]).norm().item()
     assert length == pytest.approx(math.dist((0, 0), (22, 4 * math.sin(5.5))), rel=1e-3)

@@ -6,8 +6,9 @@ import torch
 from support.tiny_scene import tiny_scene, truth
 
 from padgs.baselines.sc_omnigs import SCOmniGSMethod
+from padgs.geometry.similarity import Similarity
 from padgs.render import RenderOptions, render
-from padgs.training.corrections import PoseRefinement, Similarity, align
+from padgs.training.corrections import PoseRefinement, align
 from padgs.training.options import Budget
 
 VIEWS = tiny_scene().train

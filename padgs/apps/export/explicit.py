@@ -14,6 +14,7 @@ from padgs.data.capture import DataError
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
+from padgs.geometry.similarity import Similarity
 from padgs.methods.anchors.method import AnchorModel
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
@@ -21,7 +22,6 @@ from padgs.methods.splats.splats import Splats
 from padgs.render import Rendering, render
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
-from padgs.training.corrections import Similarity
 
 DISTILLATION_STEPS = 300
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"

@@ -17,7 +17,7 @@ from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import inspect, save_png
 from padgs.data.masks import write_masks
-from padgs.data.metres import KnownLength, to_metres, unit_note, write_unit
+from padgs.data.metres import KnownLength, moved, to_metres, unit_note, write_unit
 from padgs.files import draft_of
 from padgs.scene import Scene
 
@@ -71,8 +71,8 @@ def convert(
             scale = 1.0
             if found := to_metres(content.frames, content.cloud, known):
                 change, note = found
-                scale, cloud = change.scale, content.cloud and change.cloud(content.cloud)
-                content = replace(content, frames=change.frames(content.frames), cloud=cloud)
+                scale, (frames, cloud) = change.scale, moved(content.frames, content.cloud, change)
+                content = replace(content, frames=frames, cloud=cloud)
                 scene = replace(scene, notes=(*scene.notes, note))
                 write_unit(partial, note)
             elif notes := unit_note(capture.folder):

@@ -26,7 +26,7 @@ from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
-from padgs.data.metres import UPRIGHT, WorldChange, rotation_to_z, to_metres, write_unit
+from padgs.data.metres import UPRIGHT, moved, rotation_to_z, scaled, to_metres, write_unit
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
@@ -244,7 +244,7 @@ class _Job:
             notes.append(note)
         if found := to_metres(frames, cloud, self.options.known):
             change, note = found
-            frames, cloud = change.frames(frames), change.cloud(cloud)
+            frames, cloud = moved(frames, cloud, change)
             write_unit(partial_folder, note)
             notes.append(note)
         else:
@@ -314,5 +314,5 @@ def level_world(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, .
     estimate = gravity(torch.stack([frame.cam_from_world for frame in frames]))
     if estimate.agreement < UPRIGHT:
         return frames, cloud, "the cameras have no common up direction; the world is not rotated"
-    change = WorldChange(rotation=rotation_to_z(torch.tensor(estimate.up, dtype=torch.float64)))
-    return change.frames(frames), change.cloud(cloud), "the world's +z is the cameras' common up direction"
+    change = scaled(1.0, rotation_to_z(torch.tensor(estimate.up, dtype=torch.float64)))
+    return *moved(frames, cloud, change), "the world's +z is the cameras' common up direction"

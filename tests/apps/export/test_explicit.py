@@ -19,8 +19,8 @@ from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
+from padgs.geometry.similarity import Similarity
 from padgs.render import RenderOptions, render
-from padgs.training.corrections import Similarity
 
 RULES = replace(PROTOCOLS["sphere"], lpips="none", metrics=("ws_psnr",))
 
