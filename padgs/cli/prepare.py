@@ -50,6 +50,7 @@ def prepare(
     level: Annotated[bool, typer.Option(help="turn the world so that the cameras' common up is +z")] = True,
     per_second: Annotated[float, typer.Option(help="frames kept per second of video")] = 2.0,
     seed: Annotated[int, typer.Option(help="of all random choices")] = 0,
+    mapper: Annotated[str, typer.Option(help="incremental, or global: place all panoramas at once")] = "incremental",
     metres: Metres = None,
     camera_height: CameraHeight = None,
     gps: Gps = False,
@@ -74,7 +75,7 @@ def prepare(
     try:
         with _bars() as tell:
             known = KnownLength(metres, camera_height, gps)
-            options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, known, threads)
+            options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, mapper, known, threads)
             result = find_poses(Path(source), target, options, tell)
             report = check(target, overlay=overlay_path(target))
     except KeyboardInterrupt as interrupt:

@@ -229,7 +229,8 @@ class _Job:
     def _reconstruct(self) -> None:
         parts = self.folder.empty("parts")
         progress, seed = partial(self.progress, "poses"), self.options.seed
-        if not sfm.reconstruct(self.database, self.feature_images, parts, self.threads, seed, self.views, progress):
+        rest = self.threads, seed, self.views, progress, self.options.mapper
+        if not sfm.reconstruct(self.database, self.feature_images, parts, *rest):
             raise DataError(f"no relative pose was found for any two of the {len(self.files)} panoramas; {_REMEDIES}")
 
     def _write(self) -> Prepared:

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from padgs.data.capture import DataError
 from padgs.data.formats.colmap import pycolmap_module
 
+MAPPERS = ("incremental", "global")
 Progress = Callable[[int, int], None]  # (done, total)
 
 # Tuned on real indoor and garden panoramas. COLMAP's defaults find only a thousand features in textureless rooms at
@@ -137,19 +139,38 @@ def match(
 
 
 def reconstruct(
-    database: Path, folder: Path, parts: Path, threads: int, seed: int, images_per_pose: int, progress: Progress
+    database: Path,
+    folder: Path,
+    parts: Path,
+    threads: int,
+    seed: int,
+    images_per_pose: int,
+    progress: Progress,
+    mapper: str = "incremental",
 ) -> int:
     """Compute poses and points, and write a model for each part that cannot be connected to others.
 
-    `images_per_pose` is the number of views in a rig, else 1.
+    `images_per_pose` is the number of views in a rig, else 1. `mapper` is one of `MAPPERS`: incremental adds one
+    panorama after the other, global places all at once.
 
     Returns:
         Number of parts; 0 if no two images could be placed.
+
+    Raises:
+        DataError: the installed pycolmap has no global mapper.
     """
     pycolmap = pycolmap_module()
     pycolmap.set_random_seed(seed)
     with pycolmap.Database.open(database) as found:
         total = found.num_images() // images_per_pose
+    if mapper == "global":
+        if not hasattr(pycolmap, "global_mapping"):
+            raise DataError(f"pycolmap {pycolmap.__version__} has no global mapper; update it, or leave out --mapper")
+        options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
+        adjustment = options.mapper.bundle_adjustment
+        adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
+        options.mapper.refine_sensor_from_rig = adjustment.refine_sensor_from_rig = False
+        return len(pycolmap.global_mapping(database, folder, parts, options))
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
     # For a panoramic camera, forward motion is as good as any other direction.
     options.mapper.init_max_forward_motion = 1.0

@@ -21,6 +21,7 @@ from padgs.data.capture import DataError
 from padgs.data.masks import mask_path
 from padgs.data.metres import KnownLength
 from padgs.data.prepare.pairs import PAIRS
+from padgs.data.prepare.sfm import MAPPERS
 from padgs.data.prepare.sources import find_source, is_video
 
 LOCK = ".lock"  # of the process that works in the folder
@@ -77,12 +78,14 @@ class PrepareOptions:
     level: bool = True  # rotate the world so that the cameras' common up is +z
     per_second: float = 2.0  # frames kept of a video
     seed: int = 0
+    mapper: str = "incremental"  # incremental | global
     known: KnownLength = KnownLength()  # sets the scale of the world
     threads: int = 0  # 0 = one per processor, at most 8, limited by free memory
 
     def __post_init__(self) -> None:
-        if self.pairs not in PAIRS:
-            raise DataError(f"unknown pairs {self.pairs!r}; known: {', '.join(PAIRS)}")
+        for what, name, names in (("pairs", self.pairs, PAIRS), ("mapper", self.mapper, MAPPERS)):
+            if name not in names:
+                raise DataError(f"unknown {what} {name!r}; known: {', '.join(names)}")
         if not 0 < self.per_second <= 1000:
             raise DataError(f"per_second is {self.per_second}; it must be above 0 and at most 1000 frames a second")
         if self.threads < 0:
