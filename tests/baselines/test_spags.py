@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 from support.composed import composed
-from support.states import assert_same_but_time
-from support.tiny_scene import squared_error, tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.baselines.spags import SPaGSMethod, SPaGSOptions
@@ -21,7 +20,6 @@ from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends.cpu import Projected
 from padgs.render.backends.native import native_camera
 from padgs.scene import Scene
-from padgs.training.options import Budget
 
 WIDTH, HEIGHT = 2048, 1024
 OPTIONS = SPaGSMethod.RENDER.options(scene_scale=1.0)
@@ -189,24 +187,3 @@ def native_boxes(gaussians):
     structure = Inputs(len(gaussians), *map(pointer, inputs), None)
     options = RenderOptions(projection="ray", low_pass=0.0)
     return Projected(native_camera(torch.eye(4), Panorama(WIDTH, HEIGHT), options), structure, 1 << 26).boxes.double()
-
-
-def test_learns_densifies_and_resumes(scene):
-    """The tiny room, from its points; stopped in the middle it ends with the same bits."""
-
-    def method() -> SPaGSMethod:
-        return SPaGSMethod(SPaGSOptions(densify_until=20_000, gradient_threshold=5e-6, max_gaussians=60))
-
-    whole, first, second = method(), method(), method()
-    records = whole.fit(scene, Budget(120))
-    next(records)
-    start = squared_error(whole, scene.test[0])
-    counts = [record.counts["gaussians"] for record in records]
-    assert squared_error(whole, scene.test[0]) < 0.5 * start
-    assert max(counts) == 60
-    interrupted = first.fit(scene, Budget(120))
-    for _ in range(70):
-        next(interrupted)
-    second.load_state(first.state())
-    list(second.fit(scene, Budget(120)))
-    assert_same_but_time(second.state(), whole.state())
