@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from padgs import results
-from padgs.data.camera_paths import interpolate_poses
+from padgs.data.camera_paths import along_cameras
 from padgs.data.capture import DataError
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import score
@@ -111,17 +110,10 @@ class LoadedRun:
         return score(self.method.render, self.scene, {protocol: rules[protocol]}, None)[protocol]
 
     def camera_path(self, frames: int) -> list[View]:
-        """Return `frames` views along a path through the training cameras in their order, evenly spaced in number."""
-        views = self.scene.train
-        if len(views) < 2 or frames < 2:
-            raise ValueError(f"a path of {frames} frames through {len(views)} views; it takes at least two of both")
-        poses = interpolate_poses(
-            torch.stack([view.cam_from_world for view in views]), np.linspace(0, len(views) - 1, frames)
-        )
-        return [
-            replace(views[0].at(pose.to(views[0].cam_from_world)), name=f"frame-{number:05d}")
-            for number, pose in enumerate(poses)
-        ]
+        """Return `frames` views along the path through the training cameras that `padgs render` takes."""
+        camera = self.scene.train[0]
+        poses = along_cameras(self.scene, frames)
+        return [replace(camera.at(pose.numpy()), name=f"frame-{number:05d}") for number, pose in enumerate(poses)]
 
     def through(self, camera: Camera) -> Method:
         """Return a method that can render this camera: the run's own, or a copy with other render settings.
