@@ -39,6 +39,7 @@ def _itself(store: ConfigStore, _: dict) -> ConfigStore:
 
 
 ConfigStore.__deepcopy__ = _itself  # type: ignore[attr-defined]
+_registered: list[tuple[Path, dict[str, Any]]] = []  # folder of `conf`, and methods, whose choices Hydra knows
 
 
 @contextmanager
@@ -102,10 +103,12 @@ def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:
 
 
 def register_choices() -> None:
-    """Register the keys and defaults of dataclasses with Hydra, and the choices of groups that have no file.
+    """Register the keys and defaults of dataclasses with Hydra, and the choices of groups that have no file, once.
 
     A method of another package that cannot be imported is reported once and removed from METHODS.
     """
+    if _registered == [(root(), {**METHODS})]:
+        return
     OmegaConf.register_new_resolver("all_conditions", stress_conditions, replace=True)
     store = ConfigStore.instance()
     store.store(name="fields", node=default_fields())
@@ -127,6 +130,7 @@ def register_choices() -> None:
     for group, rows in {"scene": scene_choices(), **variant_choices(), **set_choices()}.items():
         for name, node in rows.items():
             store.store(group=group, name=name, node=node, package="_global_")
+    _registered[:] = [(root(), {**METHODS})]
 
 
 def variant_choices() -> dict[str, dict[str, dict[str, Any]]]:

@@ -119,6 +119,7 @@ def chart(sweep: Sweep) -> Chart:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
     name = "without a name" if sweep.name == AD_HOC else sweep.name
     title = f"Sweep {name}: mean and standard deviation over seeds"
+    title += "; dotted: the paper's value" if sweep.key in PAPER_CHOICES else ""
     lay_out(made, title)
     return Chart(f"sweep_{sweep.name.replace('@', '_')}", title, made, sweep.notes, sweep.numbers)
 

@@ -120,16 +120,19 @@ def draw(
 def time_chart(trade_off: TradeOff) -> Chart | None:
     """Return held-out PSNR over training seconds, with a label where a run ends; None if no run has a log.
 
-    The axis of quality shows the range of the later halves of the runs (`axis.window`). Releases are dashed. `NAMED`
-    methods have a colour and a name at their best setting; dips after resets of opacities are left out.
+    The axis of quality shows the later halves of the runs (`axis.window`) and the best of each. Releases are dashed.
+    `NAMED` methods have a colour and a name at their best setting; dips after resets of opacities are left out.
     """
     curves = _curves(trade_off)
     if not curves:
         return None
     made, axes = figure(1, 1, *TIME_SIZE)
     panel, presets, labels = axes[0, 0], [setting.preset for setting, _, _ in curves], []
-    set_axis(panel.xaxis, [s for _, seconds, _ in curves for s in seconds if s > 0], logarithmic=True)
-    low, high = set_axis(panel.yaxis, [v for _, _, psnr in curves for v in psnr[len(psnr) // 2 :]], worse=-1)
+    low, high = set_axis(
+        panel.yaxis, [v for _, _, psnr in curves for v in (*psnr[len(psnr) // 2 :], max(psnr))], worse=-1
+    )
+    points = [point for _, seconds, psnr in curves for point in zip(seconds, psnr, strict=True)]
+    set_axis(panel.xaxis, [s for s, value in points if s > 0 and low <= value <= high], logarithmic=True)
     named = _named(trade_off, curves, low, high)
     for setting, seconds, psnr in curves:
         title, preset, role = setting.title, setting.preset, trade_off.role(setting.preset)
@@ -140,7 +143,8 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
         if named.get(preset) == title:
             text = methods.short(title, preset)
             labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
-    panel.set_xlabel("training time in seconds, evaluations not counted")
+    time = "training time on the CPU" if trade_off.on_cpu else "training time"
+    panel.set_xlabel(f"{time} in seconds, evaluations not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
     meaning = "without dips after resets; grey: other methods, dashed: as released"
     title = f"{trade_off.title}\nquality over training time, {meaning}"
@@ -162,14 +166,19 @@ def _named(trade_off: TradeOff, curves: Sequence[Any], low: float, high: float) 
 
 
 def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]]]:
-    """Return seconds and PSNR of each setting, evaluation by evaluation, as means over its runs with a complete log."""
+    """Return seconds and PSNR of each setting, evaluation by evaluation, as means over its runs with a complete log.
+
+    Logs have wall time, which is scaled so that it ends with the run's CPU time where that is known.
+    """
     found = []
     for setting in settings(trade_off.runs):
-        logs = [log for log in setting.runs["log"] if log["psnr"]]
-        count = max((len(log["psnr"]) for log in logs), default=0)
-        complete = [log for log in logs if len(log["psnr"]) == count]  # a run that was cut short would cut the mean
+        scales = (setting.runs["train_seconds"] / setting.runs["wall_seconds"]).fillna(1.0)
+        logs = [(log, scale) for log, scale in zip(setting.runs["log"], scales, strict=True) if log["psnr"]]
+        count = max((len(log["psnr"]) for log, _ in logs), default=0)
+        complete = [(log, scale) for log, scale in logs if len(log["psnr"]) == count]  # others would cut the mean
         if complete:
-            seconds, psnr = (np.mean([log[name] for log in complete], 0).tolist() for name in ("seconds", "psnr"))
+            seconds = np.mean([scale * np.array(log["seconds"]) for log, scale in complete], 0).tolist()
+            psnr = np.mean([log["psnr"] for log, _ in complete], 0).tolist()
             found.append((setting, *without_dips(seconds, psnr)))
     return found
 

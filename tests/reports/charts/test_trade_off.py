@@ -111,6 +111,15 @@ def test_quality_over_training_time_comes_from_the_logs(tmp_path, monkeypatch):
     assert time_chart(one(runs)) is None, "no quality over time without a log"
 
 
+def test_time_is_cpu_time_where_that_is_known(tmp_path, monkeypatch):
+    ends = []
+    monkeypatch.setattr(trade_off_chart, "write_labels", lambda _, __, marks: ends.extend(x for x, *_ in marks))
+    timing = {"train_seconds": 100.0, "cpu_seconds": 40.0, "render_ms_median": 40.0}
+    (logged,) = trade_offs(RunSet(frame(store.read(write([small(25.0, timing=timing)], tmp_path))[0])))
+    (panel,) = time_chart(logged).figure.axes
+    assert ends == [pytest.approx(40.0)] and panel.get_xlabel().startswith("training time on the CPU")
+
+
 def test_each_method_has_one_name_over_time_at_its_best_setting_within_the_axis():
     made = one([small(20 + n, 1.0, method=preset) for n, preset in enumerate(["padgs", "odgs", "spags", "omnigs"])])
     ends = [
