@@ -37,6 +37,7 @@ class View:
     lens: Camera | None = None  # None: a panorama of this size
     load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] distance along the ray; 0, NaN = unknown, inf = sky
     depth_is_relative: bool = False  # inverse distances are known up to a scale and a shift; not scored
+    share: float = 1.0  # of the passes over all training views in which this one is drawn
 
     @property
     def camera(self) -> Camera:

@@ -122,7 +122,6 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     clusters = sorted((np.sort(part) for part in bisect(affinity, views_of_train, count)), key=lambda part: part[0])
     owner = _owners(train, seen, points, clusters)
     rays = Panorama(2 * ROWS, ROWS).rays(dtype=torch.float64).reshape(-1, 3).numpy()
-    area = (solid_angle_weight(ROWS, dtype=torch.float64)[:, None].repeat(1, 2 * ROWS)).numpy()
     share = np.zeros((len(views), count))  # of the sphere of each view that belongs to each block
     directions: dict[tuple[int, int], np.ndarray] = {}  # view, block -> directions that belong to it
     for row, view in enumerate(views):
@@ -133,7 +132,7 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
         near = owner[index][tree.query(rays, k=min(NEIGHBOURS, len(index)))[1]].reshape(len(rays), -1)
         for block in range(count):
             held = ((near == block).mean(1) >= 0.5).reshape(ROWS, 2 * ROWS)
-            share[row, block] = (held * area).sum() / area.sum()
+            share[row, block] = sphere_share(held)
             if share[row, block] >= MARGIN:
                 directions[row, block] = held
     margin, tests, used = [], [], np.zeros((count, len(points)), bool)
@@ -146,6 +145,11 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
         tests.append([test[n] for n in own])
         used[block] = (seen[cluster].mean(0) >= SEEN) | (owner == block)
     return Plan(points, owner, [[train[n] for n in cluster] for cluster in clusters], margin, tests, used)
+
+
+def sphere_share(held: np.ndarray) -> float:
+    """Return the share of the sphere that directions [ROWS, 2 ROWS] fill."""
+    return float(np.average(held.mean(1), weights=solid_angle_weight(ROWS, dtype=torch.float64).numpy()))
 
 
 def _owners(train: Sequence[View], seen: np.ndarray, points: Tensor, clusters: Sequence[np.ndarray]) -> np.ndarray:
@@ -194,8 +198,10 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
                 (folder / link).parent.mkdir(parents=True, exist_ok=True)
                 (folder / link).symlink_to(os.path.relpath(image, (final / link).parent.absolute()))
             kept = torch.from_numpy(blocks.used[number][nearest])
+            shares = {view.name: round(sphere_share(held), 4) for view, held in blocks.margin[number]}
+            sizes = {view.name: {"width": view.width, "height": view.height} for view in views}
             content = Content(
-                frames=tuple(replace(frames[v.name], width=v.width, height=v.height) for v in views),
+                frames=tuple(replace(frames[v.name], **sizes[v.name], share=shares.get(v.name, 1.0)) for v in views),
                 cloud=Cloud(points[kept], None if colors is None else colors[kept]),
                 tracks=None,
                 split={side: tuple(frames[v.name].name for v in part) for side, part in sides.items() if scene.test},

@@ -60,7 +60,14 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device, folder)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = [
-        View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
+        View(
+            view_name(frame.name),
+            frame.cam_from_world,
+            *size,
+            StoredImage(frame.image, *size, store),
+            mask,
+            share=frame.share,
+        )
         for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
     views, depth_digests, depth_notes = with_depths(views, capture, options)
@@ -78,6 +85,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
         digest.update(view.cam_from_world.numpy().tobytes())
     digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
+    if any(view.share != 1 for view in views):
+        digest.update(f"shares{[view.share for view in views]}".encode())
     if depth_digests:
         digest.update(f"depths{depth_digests}".encode())
     digest.update(scene.points.numpy().tobytes())

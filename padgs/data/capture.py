@@ -67,6 +67,7 @@ class Frame:
     height: int | None = None
     mask: Path | None = None  # if the format names one
     depth: Path | None = None  # if the format names one
+    share: float = 1.0  # of `padgs.scene.View`
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,10 @@ def halved(view: View) -> View:
 
 
 class TrainingViews:
-    """The training views of a scene with their targets, one after the other, in random order without replacement."""
+    """The training views of a scene with their targets, one after the other, in random order without replacement.
+
+    A view with a `share` below 1 is left out of as many passes, at random.
+    """
 
     def __init__(
         self,
@@ -201,7 +204,14 @@ class TrainingViews:
 
     def _shuffled(self) -> Tensor:
         indices = [index for index in range(len(self._scene.train)) if index not in self._held_out]
-        return torch.tensor(indices)[torch.randperm(len(indices), generator=self._generator)]
+        order = torch.tensor(indices)[torch.randperm(len(indices), generator=self._generator)]
+        shares = torch.tensor([self._scene.train[index].share for index in order.tolist()])
+        if (shares == 1).all():
+            return order
+        drawn = torch.tensor([False])
+        while not drawn.any():
+            drawn = torch.rand(len(order), generator=self._generator) < shares
+        return order[drawn]
 
     def state(self) -> State:
         """Return all that decides the views to come; not copies."""

@@ -96,7 +96,8 @@ def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
         for view, held in margin:
             mask = by_name[view.name].mask()
             assert mask is not None and 0.04 < held.mean() < 0.6 and 0.04 < mask.mean() < 0.6
-        assert all(by_name[view.name].mask() is None for view in core)
+            assert by_name[view.name].share == pytest.approx(blocks.sphere_share(held), abs=1e-4)
+        assert all(by_name[view.name].mask() is None and by_name[view.name].share == 1 for view in core)
         assert len(scene.points) < 0.9 * len(whole.points)
         assert all(path.is_symlink() for path in (part / "images").iterdir())
     alone = blocks.plan(capture, assemble(capture, DataOptions(split="all")), 2)

@@ -1,9 +1,12 @@
+from collections import Counter
+from dataclasses import replace
+
 import pytest
 import torch
 
 import padgs.training.targets
-from padgs.scene import View
-from padgs.training.targets import Targets
+from padgs.scene import Scene, View
+from padgs.training.targets import Targets, TrainingViews
 
 PIXELS = torch.arange(96, dtype=torch.uint8).reshape(4, 8, 3)
 
@@ -39,3 +42,13 @@ def test_weights_are_kept_only_while_there_is_room(monkeypatch):
 def test_unusable_pixels_are_named(pixels, mask, message):
     with pytest.raises(ValueError, match=message):
         Targets([view(pixels, mask)], "solid_angle").at(0)
+
+
+def test_views_are_drawn_by_their_share():
+    views = tuple(replace(view(PIXELS), share=share) for share in (1.0, 1.0, 0.25, 0.05))
+    order = TrainingViews(Scene("s", views, (), torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), ""))
+    drawn = Counter(order.next_index() for _ in range(4600))  # 2000 passes of 2.3 views
+    assert abs(drawn[0] - drawn[1]) <= 1 and abs(drawn[0] - 2000) < 60
+    assert abs(drawn[2] - 500) < 80 and abs(drawn[3] - 100) < 45, "within 4 standard deviations"
+    alone = TrainingViews(Scene("s", views[3:], (), torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), ""))
+    assert alone.next_index() == 0

@@ -95,7 +95,15 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
         width=width and width.whole(),
         height=height and height.whole(),
         mask=mask and mask.path_in(root),
+        share=1.0 if (share := frame.get("share")) is None else _share(share),
     )
+
+
+def _share(stated: Json) -> float:
+    share = stated.numbers()
+    if share.ndim or not 0 < share <= 1:
+        raise DataError(f"{stated.where} is {stated.value}; it must be a number above 0 and at most 1, for each pass")
+    return share.item()
 
 
 def _name(path: Json) -> str:

@@ -65,7 +65,7 @@ def write_transforms(content: Content, folder: Path) -> None:
         width, height = _size(frame)
         pose = torch.linalg.inv(frame.cam_from_world)
         pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_OPENGL
-        frame_size = {"w": width, "h": height}
+        frame_size = {"w": width, "h": height} | ({"share": frame.share} if frame.share != 1 else {})
         frames.append({"file_path": f"images/{frame.name}", **frame_size, "transform_matrix": pose.tolist()})
     meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
     if content.cloud is not None:

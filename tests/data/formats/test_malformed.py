@@ -80,6 +80,7 @@ WRONG: list[tuple[str, tuple[Any, ...], Any, str]] = [
     ("transforms", ("camera_model",), GONE, "camera_model None"),
     ("transforms", ("frames",), GONE, "lacks the field 'frames'; it has camera_model, w, h"),
     ("transforms", POSE, GONE, "pano_03.png .* lacks the field 'transform_matrix'"),
+    ("transforms", ("frames", 3, "share"), 0, "share .* is 0; it must be a number above 0 and at most 1"),
     ("transforms", (*POSE, 0, 3), float("nan"), "pano_03.png .*contains nan"),
     ("transforms", (*POSE, 0, 3), 1e300, r"contains 1e\+300; nothing farther"),
     ("transforms", POSE, times(2, 2, 2), "pano_03.png .* a rotation times 2; scale belongs"),
