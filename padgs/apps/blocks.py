@@ -2,8 +2,9 @@
 
 Cameras that see the same points form a block (recursive spectral bisection of their normalized graph), whatever lies
 between them on a plan. A point belongs to the block whose cameras see it best, and any other place to the block of the
-nearest point. A block trains on its own cameras and on the margin: other cameras that see into it, masked to what
-belongs to it. A merged model has of each run the Gaussians that lie in its block.
+nearest point. A block trains on its own cameras and on the margin: other cameras that see into it. All are masked to
+what belongs to it and a rim around that, and drawn in proportion to what that leaves. A merged model has of each run
+the Gaussians that lie in its block.
 """
 
 import hashlib
@@ -45,6 +46,7 @@ OCCLUSION = 1.05  # a point farther than so many times the surface is hidden
 SLACK = 0.25  # cuts may deviate from equal blocks by this share, to pass through a door
 ROWS = 48  # of the grid of directions that margin cameras are masked by
 NEIGHBOURS = 4  # points that decide to which block a direction belongs, by at least half
+RIM = 2  # cells of that grid by which masks are wider, so that both sides of a border train on it
 MARGIN = 0.04  # share of the sphere of a margin camera that its block fills at least
 SEEN = 0.1  # share of the cameras of a block that see a point of another block which it begins with
 REGIONS = "regions.npz"  # beside the blocks: points, and the block of each
@@ -94,13 +96,15 @@ class Plan:
     points: Tensor  # [S, 3] float64, of the cloud
     owner: np.ndarray  # [S] block of each point
     core: list[list[View]]  # training views of each block
-    margin: list[list[tuple[View, np.ndarray]]]  # other views, and the directions that belong to it
+    margin: list[list[View]]  # other views that see into it
+    held: list[dict[str, np.ndarray]]  # view of core or margin -> directions [ROWS, 2 ROWS] that belong to it
     test: list[list[View]]
     used: np.ndarray  # [blocks, S] points that a block begins with
 
 
 def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     """Divide the views of a scene, in the world of its poses as the capture states them."""
+    from scipy.ndimage import binary_dilation
     from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
@@ -134,17 +138,21 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
             held = ((near == block).mean(1) >= 0.5).reshape(ROWS, 2 * ROWS)
             share[row, block] = sphere_share(held)
             if share[row, block] >= MARGIN:
-                directions[row, block] = held
-    margin, tests, used = [], [], np.zeros((count, len(points)), bool)
+                around = np.hstack([held] * 3)  # continued across the seam
+                directions[row, block] = binary_dilation(around, iterations=RIM)[:, 2 * ROWS : 4 * ROWS]
+    margin, held_by, tests, used = [], [], [], np.zeros((count, len(points)), bool)
     best = share[len(train) :].argmax(1) if test else np.zeros(0, int)
     for block, cluster in enumerate(clusters):
         others = np.setdiff1d(views_of_train, cluster)
-        margin.append([(train[n], directions[n, block]) for n in others.tolist() if (n, block) in directions])
+        margin.append([train[n] for n in others.tolist() if (n, block) in directions])
+        held_by.append(
+            {train[n].name: held for (n, one), held in directions.items() if one == block and n < len(train)}
+        )
         own = (best == block).nonzero()[0].tolist()
         own = own or [int(share[len(train) :, block].argmax())] if test else []
         tests.append([test[n] for n in own])
         used[block] = (seen[cluster].mean(0) >= SEEN) | (owner == block)
-    return Plan(points, owner, [[train[n] for n in cluster] for cluster in clusters], margin, tests, used)
+    return Plan(points, owner, [[train[n] for n in part] for part in clusters], margin, held_by, tests, used)
 
 
 def sphere_share(held: np.ndarray) -> float:
@@ -190,7 +198,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             name = f"{scene.name}-block-{number + 1}"
             folder, final = partial / name, destination / name
             folder.mkdir()
-            margin = [view for view, _ in blocks.margin[number]]
+            margin, held = blocks.margin[number], blocks.held[number]
             sides = {"train": [*core, *margin], "test": blocks.test[number]}
             views = [*sides["train"], *sides["test"]]
             for view in views:
@@ -198,7 +206,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
                 (folder / link).parent.mkdir(parents=True, exist_ok=True)
                 (folder / link).symlink_to(os.path.relpath(image, (final / link).parent.absolute()))
             kept = torch.from_numpy(blocks.used[number][nearest])
-            shares = {view.name: round(sphere_share(held), 4) for view, held in blocks.margin[number]}
+            shares = {name: round(sphere_share(part), 4) for name, part in held.items()}
             sizes = {view.name: {"width": view.width, "height": view.height} for view in views}
             content = Content(
                 frames=tuple(replace(frames[v.name], **sizes[v.name], share=shares.get(v.name, 1.0)) for v in views),
@@ -207,7 +215,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
                 split={side: tuple(frames[v.name].name for v in part) for side, part in sides.items() if scene.test},
             )
             write_transforms(content, folder)
-            within = {view.name: partial_mask(view, held) for view, held in blocks.margin[number]}
+            within = {view.name: partial_mask(view, held[view.name]) for view in (*core, *margin) if view.name in held}
             write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
             if (folder / "masks").is_dir():  # they hide most of a view, and are meant to
                 described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))

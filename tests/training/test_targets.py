@@ -47,8 +47,8 @@ def test_unusable_pixels_are_named(pixels, mask, message):
 def test_views_are_drawn_by_their_share():
     views = tuple(replace(view(PIXELS), share=share) for share in (1.0, 1.0, 0.25, 0.05))
     order = TrainingViews(Scene("s", views, (), torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), ""))
-    drawn = Counter(order.next_index() for _ in range(4600))  # 2000 passes of 2.3 views
+    drawn = Counter(order.next(1.0)[0] for _ in range(4600))  # 2000 passes of 2.3 views
     assert abs(drawn[0] - drawn[1]) <= 1 and abs(drawn[0] - 2000) < 60
     assert abs(drawn[2] - 500) < 80 and abs(drawn[3] - 100) < 45, "within 4 standard deviations"
     alone = TrainingViews(Scene("s", views[3:], (), torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), ""))
-    assert alone.next_index() == 0
+    assert alone.next(1.0)[0] == 0
