@@ -82,6 +82,8 @@ def report(
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     show(f"{len(found)} results, {len(broken)} left out; see {target}", sys.stderr)
+    page = f"open {target / 'report.html'} in a browser" if what in ("html", ALL) else f"padgs report html {source}"
+    show(f"next: {page}", sys.stderr)
     for warning in dict.fromkeys(run_set.warnings):
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):

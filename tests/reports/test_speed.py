@@ -7,7 +7,7 @@ import pytest
 from support.made_up import METHODS, compared, data_set, swept, write
 
 RESULTS = 1000
-SECONDS = 40.0  # of CPU time, 34 on an EPYC with AVX2; what others do on the machine does not count
+SECONDS = 25.0  # of CPU time, 14 on two shared cores of an EPYC
 
 
 def many() -> list:
@@ -25,7 +25,7 @@ def many() -> list:
 
 
 @pytest.mark.slow
-def test_everything_from_a_thousand_results_within_40_s(tmp_path, root):
+def test_everything_from_a_thousand_results_within_25_s(tmp_path, root):
     write(many(), tmp_path / "runs", renders=True)
     arguments = ["report", "all", tmp_path / "runs", "--out", tmp_path / "out"]
     before = _children()
