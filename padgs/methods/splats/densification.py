@@ -15,6 +15,7 @@ from torch import Tensor
 
 from padgs.checks import check, check_known
 from padgs.gaussians import rotation_matrices
+from padgs.methods.splats.error_growth import WrongPixels
 from padgs.methods.splats.splats import Splats
 from padgs.training.optimizer import append_rows, forget_moments, keep_rows
 from padgs.training.schedule import scaled
@@ -24,7 +25,11 @@ MIN_RESET_EVERY = 500  # iterations; after a reset opacities need some 200 steps
 PIECES = 2  # Gaussians that replace a split one
 SHRINK = 0.8 * PIECES  # their scales are smaller by this factor
 MIN_DECAYED_OPACITY = 1e-6
+MAX_PIECE_OPACITY = 0.99
 POSITIONAL_GRADIENTS = ("image", "space", "space_absolute")
+SPLITS = ("random", "long_axis")
+AXIS_STEP = 0.7  # of split="long_axis": distance of a piece from the middle, in standard deviations
+AXIS_WIDTH = 0.7  # ... and the factor on its other two standard deviations
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,10 @@ class DensificationOptions:
     gradient_threshold: float = 2e-4  # in the unit of the positional gradient, for a loss that is a plain mean
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
     sample_clones: bool = False  # clones are placed at random inside the Gaussian, not exactly on it (GOF)
+    # random: two pieces at random inside the Gaussian (3DGS). long_axis: two along its longest axis, which together are
+    # as opaque in the middle as it was (Improved-GS).
+    split: str = "random"
+    error_share: float = 0.0  # of the new Gaussians of a round that are placed at pixels by their error, `WrongPixels`
     min_opacity: float = 0.005  # fainter Gaussians are pruned
     opacity_decay: float = 0.0  # subtracted from all opacities in every round
     prune_by_extent: bool = False  # also prune scales above max_scale; empties scenes with little camera motion
@@ -56,7 +65,8 @@ class DensificationOptions:
         check(self, "an iteration, at least 0", lambda iteration: iteration >= 0, *times)
         sizes = ("gradient_threshold", "percent_dense", "max_scale")
         check(self, ">= 0 and finite", lambda value: 0 <= value < math.inf, *sizes)
-        check_known(self, positional_gradient=POSITIONAL_GRADIENTS)
+        check(self, "a share in [0, 1]", lambda share: 0 <= share <= 1, "error_share")
+        check_known(self, positional_gradient=POSITIONAL_GRADIENTS, split=SPLITS)
         check(self, "an opacity > 0", lambda opacity: 0 < opacity <= 1, "reset_opacity")
         check(self, "an opacity below 1", lambda opacity: 0 <= opacity < 1, "opacity_decay", "min_opacity")
         check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_gaussians")
@@ -83,7 +93,8 @@ class Densifier:
     Attributes:
         statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, and for
             space_absolute absolute [N] gradients.
-        generator: random positions of split Gaussians, on the CPU.
+        generator: random positions of new Gaussians, on the CPU.
+        wrong_pixels: candidates for growth by error; None without it.
     """
 
     def __init__(
@@ -107,6 +118,7 @@ class Densifier:
         self.splats, self.options, self.extent = splats, options, extent
         self._target = target
         self.generator = torch.Generator().manual_seed(seed)
+        self.wrong_pixels = WrongPixels(self.generator) if options.error_share > 0 else None
         self.statistics = self._empty()
 
     def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
@@ -132,21 +144,22 @@ class Densifier:
             return ()
         events = []
         if iteration > options.densify_from and iteration % options.densify_every == 0 and grows():
-            cloned, split, left_out = self._multiply(optimizer, iteration)
+            added, cloned, split, left_out = self._multiply(optimizer, iteration)
             pruned = self._prune(optimizer, iteration)
             self._decay_opacities(optimizer)
             self.reset_statistics()
-            events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
+            at_pixels = f"added {added} at pixels, " if added else ""
+            events.append(f"{at_pixels}cloned {cloned}, split {split}, pruned {pruned} Gaussians")
             if left_out:
-                total = cloned + split + left_out
+                total = added + cloned + split + left_out
                 events.append(f"max_gaussians {options.max_gaussians} left out {left_out} of {total} candidates")
         if iteration % options.reset_every == 0:
             self._reset_opacities(optimizer)
             events.append("reset opacities")
         return tuple(events)
 
-    def _multiply(self, optimizer: torch.optim.Adam, iteration: int) -> tuple[int, int, int]:
-        """Clone and split within `max_gaussians`; return the numbers of cloned, split and left-out Gaussians."""
+    def _multiply(self, optimizer: torch.optim.Adam, iteration: int) -> tuple[int, int, int, int]:
+        """Add, clone and split within `max_gaussians`; return the numbers added, cloned, split and left out."""
         rows = self.splats.rows()
         seen = self.statistics["seen"].clamp(min=1)
         mean_gradient = self.statistics["gradient"] / seen
@@ -158,15 +171,20 @@ class Densifier:
             room = max(0, self.options.max_gaussians - len(chosen))
             if candidate_count > room:
                 chosen = _largest(torch.where(chosen, mean_gradient, -1.0), room)
+        new = {name: value[:0] for name, value in rows.items()}
+        if self.wrong_pixels is not None:
+            wanted = int(chosen.sum())
+            new = self.wrong_pixels.take(round(self.options.error_share * wanted), rows)
+            chosen = _largest(torch.where(chosen, mean_gradient, -1.0), wanted - len(new["means"]))
         small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
         clones = self._copies(chosen & small, 1, sampled=self.options.sample_clones)
         pieces = self._pieces(chosen & ~small)
-        append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name])) for name in rows})
+        append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name], new[name])) for name in rows})
         replaced = torch.zeros(len(self.splats), dtype=torch.bool, device=chosen.device)
         replaced[: len(chosen)] = chosen & ~small
         keep_rows(rows, optimizer, ~replaced)
-        cloned, split = len(clones["means"]), len(pieces["means"]) // PIECES
-        return cloned, split, candidate_count - cloned - split
+        added, cloned, split = len(new["means"]), len(clones["means"]), len(pieces["means"]) // PIECES
+        return added, cloned, split, candidate_count - added - cloned - split
 
     def _above_threshold(self, mean_gradient: Tensor, seen: Tensor) -> Tensor:
         """Return which Gaussians [N] exceed the threshold; means are over `seen` [N] views."""
@@ -187,9 +205,27 @@ class Densifier:
         return chosen | _largest(absolute, count - int(chosen.sum()))
 
     def _pieces(self, split: Tensor) -> dict[str, Tensor]:
-        """Return rows that replace the Gaussians marked in split [N]: smaller ones at random places inside them."""
+        """Return rows that replace the Gaussians marked in split [N]: smaller ones inside them."""
+        if self.options.split == "long_axis":
+            return self._pieces_of_long_axis(split)
         pieces = self._copies(split, PIECES, sampled=True)
         pieces["log_scales"] = pieces["log_scales"] - math.log(SHRINK)
+        return pieces
+
+    def _pieces_of_long_axis(self, split: Tensor) -> dict[str, Tensor]:
+        """Return pairs at +- `AXIS_STEP` on the longest axis, whose variance with that of the pair is as before."""
+        pieces = self._copies(split, PIECES, sampled=False)
+        scales, step = torch.exp(pieces["log_scales"]), AXIS_STEP
+        axis = torch.nn.functional.one_hot(scales.argmax(-1), 3).to(scales)
+        sides = scales.new_tensor((step, -step)).repeat(len(scales) // PIECES)[:, None]
+        rotations = rotation_matrices(pieces["quats"])
+        pieces["means"] = pieces["means"] + (rotations @ (sides * axis * scales)[..., None])[..., 0]
+        factors = torch.where(axis > 0, math.sqrt(1 - step * step), AXIS_WIDTH)
+        pieces["log_scales"] = pieces["log_scales"] + factors.log()
+        # In the middle each piece has `share` of its opacity: 1 - (1 - o share)^2 is the opacity of before.
+        share = math.exp(-0.5 * step * step / (1 - step * step))
+        opacities = (1 - (1 - torch.sigmoid(pieces["opacity_logits"])).sqrt()) / share
+        pieces["opacity_logits"] = torch.logit(opacities.clamp(max=MAX_PIECE_OPACITY), eps=MIN_DECAYED_OPACITY)
         return pieces
 
     def _copies(self, which: Tensor, times: int, *, sampled: bool) -> dict[str, Tensor]:
