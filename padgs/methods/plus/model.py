@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 DEGREE_SHARE = 0.1  # of the run, between two SH degrees
 DROPOUT_UNTIL = 0.9  # share of the run after which no Gaussians are dropped
+SMOOTH_UP_TO = 4.0  # scene scales; surfaces farther away are smoothed less
 CAMERAS = "cameras"  # key of the training cameras in a state
 
 
@@ -57,7 +58,8 @@ class PlusModel(SplatModel):
         if options.size_weight > 0:
             penalties.append(options.size_weight * mean_angular_size(drawing.gaussians, view, near=near))
         if options.smoothness_weight > 0:
-            penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near))
+            far = SMOOTH_UP_TO * self.splats.scene_scale
+            penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near, far=far))
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
     def _training_gaussians(self, gaussians: Gaussians) -> Gaussians:

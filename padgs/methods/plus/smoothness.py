@@ -9,6 +9,8 @@ On the CPU one native call computes value and derivative (csrc/cpu/roughness.cpp
 
 import ctypes
 import functools
+import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -26,19 +28,23 @@ MAX_BEND = 0.1  # relative second difference beyond which there is an edge, with
 MIN_SIDE = 3  # pixels that second differences take
 
 
-def roughness(rendering: Rendering, camera: Camera, *, near: float) -> Tensor:
+def roughness(rendering: Rendering, camera: Camera, *, near: float, far: float = math.inf) -> Tensor:
     """Return the mean of |second difference of 1 / r| / (1 / r) across and down, a scalar.
 
     Differentiable by `rendering.depth` only. Pixels are weighted by solid angle, by the opacity along all three rays,
-    and less where the brightness bends. For cameras other than panoramas all pixels weigh the same and rows do not
-    wrap.
+    less where the brightness bends, and less beyond `far`. For cameras other than panoramas all pixels weigh the same
+    and rows do not wrap.
 
     Args:
         rendering: of [H, W] pixels, in any unit of length.
         camera: of the rendering.
         near: > 0, lower limit of distances, in the same unit.
+        far: distance r beyond which the opacity counts times far / r: no view resolves the surface of the sky.
     """
     depth, wraps = rendering.depth, isinstance(camera, Panorama)
+    if far < math.inf:
+        resolved = (far / depth.detach().clamp(min=near)).clamp(max=1)
+        rendering = replace(rendering, transmittance=1 - resolved * (1 - rendering.transmittance.detach()))
     rows = depth.new_ones(len(depth))
     if wraps:
         rows = solid_angle_weight(len(depth), dtype=depth.dtype, device=depth.device)

@@ -55,6 +55,16 @@ def test_roughness_at_poles_and_seam_vanishes_with_resolution(normal):
     assert rough(wavy(128, normal) * noise) > 20 * fine
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_lies_far_away_counts_less(dtype):
+    """Beyond `far` the opacity counts far / r, and the weight is the product of three opacities."""
+    noise = 1 + 1e-3 * torch.rand(8, 16, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    drawn, camera = shown(noise), Panorama(16, 8)
+    all_of_it = roughness(drawn, camera, near=1e-6).item()
+    assert all_of_it > 0 and roughness(drawn, camera, near=1e-6, far=1.1).item() == pytest.approx(all_of_it)
+    assert roughness(drawn, camera, near=1e-6, far=0.5).item() == pytest.approx(all_of_it / 8, rel=0.01)
+
+
 def test_roughness_is_invariant_to_units_and_heading():
     depth = wavy(64, (0.2, 0.1, 0.3)) * (1 + 0.05 * torch.rand(32, 64, dtype=torch.float64))
     assert rough(depth * 1e4) == pytest.approx(rough(depth)) and rough(depth.roll(13, 1)) == pytest.approx(rough(depth))
