@@ -33,6 +33,7 @@ UNUSED = (  # options of 3DGS that have no effect here
 )
 LONG_RUN = 2000  # iterations; shorter runs have a higher threshold
 REFERENCE_PIXELS = 2 * 256 * 128 / math.pi  # pixels of equal solid angle; larger views have a lower threshold
+FEW_VIEWS = 8  # training views that leave surfaces open
 AMPLE_PIXELS = 16  # training pixels per Gaussian that make dropout unnecessary
 
 
@@ -51,6 +52,8 @@ class PlusOptions(SplatOptions):
     threshold_pixel_exponent: float = 1.0  # threshold ~ pixel width ^ exponent, for views above 256x128; 0: constant
     threshold_full_views: int = 28  # fewer views lower the threshold less, by sqrt(views / this); 0: never less
     sample_clones: bool = True
+    split: str = "long_axis"
+    error_share: float = 0.5
     min_opacity: float = 0.05  # fainter Gaussians are pruned after each round
     initial_per_pixel: float | None = 0.6
     depth_init_per_pixel: float = 0.6
@@ -62,7 +65,7 @@ class PlusOptions(SplatOptions):
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # of the run, on views of half the width or less if they are large
     size_weight: float = 0.05  # loss weight of the mean angular size: large Gaussians cost pairs in every frame
-    smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces, which few views leave open
+    smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces with few views, see `smoothness`
     dropout: float = 0.1  # maximal share of Gaussians dropped from a training render, see `dropout_share`
 
     def __post_init__(self) -> None:
@@ -79,6 +82,14 @@ class PlusOptions(SplatOptions):
                     f"{field.name} is {getattr(self, field.name)}, but padgs_plus has densification rounds of its own "
                     f"and no resets; leave it at {field.default}"
                 )
+
+    def smoothness(self, views: int) -> float:
+        """Return the loss weight for a number of training views.
+
+        Few views leave surfaces open. It is full with up to `FEW_VIEWS`, 0 from twice as many on, and logarithmic
+        between: many views know better than the prior, above all at the poles and beside the sky (docs/plus.md).
+        """
+        return self.smoothness_weight * min(max(math.log2(2 * FEW_VIEWS / max(views, 1)), 0.0), 1.0)
 
     def dropout_share(self, pixels: float, gaussians: float) -> float:
         """Return the dropped share for a number of training pixels in all views and a number of Gaussians.

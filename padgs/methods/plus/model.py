@@ -41,6 +41,7 @@ class PlusModel(SplatModel):
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
         super().__init__(splats, options.for_views(largest, len(views)), config, **kwargs)
         self.options = options
+        self._smoothness = options.smoothness(len(views))
         self._step = 0  # last step of the schedule
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
@@ -57,9 +58,9 @@ class PlusModel(SplatModel):
         near = max(self.render_options(view).near, TINY * self.splats.scene_scale)
         if options.size_weight > 0:
             penalties.append(options.size_weight * mean_angular_size(drawing.gaussians, view, near=near))
-        if options.smoothness_weight > 0:
+        if self._smoothness > 0:
             far = SMOOTH_UP_TO * self.splats.scene_scale
-            penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near, far=far))
+            penalties.append(self._smoothness * roughness(drawing.rendering, view.camera, near=near, far=far))
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
     def _training_gaussians(self, gaussians: Gaussians) -> Gaussians:
