@@ -20,7 +20,7 @@ class EgoNeRFMethod(Method):
     """See `padgs.training.method.Method`; most options of renderer and loss do not apply."""
 
     Options = EgoNeRFOptions
-    TRAIN = TrainOptions(weight="uniform", learning_rates="published")
+    TRAIN = TrainOptions(weight="uniform", learning_rates="published", adam_beta2=0.99)
 
     def refuse_budget(self, budget: Budget) -> None:
         """Also refuse numbers of Gaussians and validation views."""

@@ -133,15 +133,6 @@ class SplatArguments(ctypes.Structure):
     ]
 
 
-class AngularSizeArguments(ctypes.Structure):
-    _fields_ = [
-        ("count", Int64),
-        ("center", ctypes.c_float * 3),
-        ("nearest", ctypes.c_float),
-        *fields(Pointer, "means", "scales", "gradient"),
-    ]
-
-
 def pointer(tensor: Tensor | None) -> int | None:
     """Return the address of a contiguous tensor, or None."""
     if tensor is None:

@@ -12,7 +12,6 @@ from padgs.native.loading import Library, declare, find_library, succeeds
 STRUCTURES = (
     *(abi.NativeCamera, abi.Inputs, abi.Gradients, abi.BlendGradientArguments, abi.DecodeGradientArguments),
     *(abi.LossArguments, abi.SplatArguments, abi.LeaveOneOutArguments, abi.RoughnessArguments),
-    abi.AngularSizeArguments,
 )
 SIGNATURES = {
     **dict.fromkeys(("padgs_blend_forward", "padgs_blend_backward", "padgs_leave_one_out"), ([Pointer], None)),
@@ -28,7 +27,6 @@ SIGNATURES = {
     "padgs_bin": ([Pointer, Int64, Pointer, Int64, *[Pointer] * 4], None),
     "padgs_sum_moments": ([Pointer, Pointer, Int64, Pointer], None),
     "padgs_core_words": ([Pointer], Int64),
-    "padgs_angular_size": ([Pointer], ctypes.c_double),
     "padgs_photometric_loss": ([Pointer], ctypes.c_double),
     "padgs_loss_workspace": ([Int32, Int32], Int64),
     "padgs_roughness": ([Pointer], ctypes.c_double),

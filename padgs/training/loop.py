@@ -38,7 +38,7 @@ class Trainer:
     `state`, taken between two records, holds all that `load_state` needs to resume bit-identically (on the CPU).
     """
 
-    ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.999), "eps": 1e-15}  # as 3DGS: gradients of a Gaussian are tiny
+    ADAM_EPS: ClassVar[float] = 1e-15  # as 3DGS: gradients of a Gaussian are tiny
     PROGRESS = (
         "iteration",
         "step",
@@ -82,7 +82,7 @@ class Trainer:
         groups = model.groups()
         self.corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self.corrections.groups(budget.iterations)]
-        self._optimizer = Optimizer(groups, options.check_every, **self.ADAM)
+        self._optimizer = Optimizer(groups, options.check_every, betas=(0.9, options.adam_beta2), eps=self.ADAM_EPS)
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out, device = self._early_stopping.held_out, self._optimizer.device
         self._unit, depth = scene.scale, options.depth_kind if options.depth_weight > 0 else None
@@ -154,7 +154,7 @@ class Trainer:
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
-                loss = target.loss(image, rendered.rendering.depth, options, self._unit)
+                loss = target.loss(image, rendered.rendering.depth, options, self._unit, step / self.schedule)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
             if checked:

@@ -20,6 +20,7 @@ from padgs.native.abi import LossArguments, pointer
 WINDOW, SIGMA = 11, 1.5  # SSIM window in pixels
 C1, C2 = 0.01**2, 0.03**2
 NORMALISATIONS = ("mean", "channel_sum")
+SQUARES_SHARE = 0.4  # of a run, at its end, in which squared errors count if they do
 MEASURED, MONOCULAR = DEPTH_KINDS = ("measured", "monocular")
 
 
@@ -84,6 +85,12 @@ def inverse_range_loss(depth: Tensor, truth: Tensor, weight: Tensor, unit: float
         inverse = slope.clamp(min=0) * given + (weight * rendered.detach()).sum()
         weight = weight * (slope > 0)
     return (weight * (rendered - inverse).abs()).sum()
+
+
+def squared_error(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Return the mean squared difference of images [H, W, 3], weighted by [H, W] or [H, 1], a scalar."""
+    weight = weight.expand(image.shape[:2])
+    return (weight * (image - target).square().mean(-1)).sum() / weight.sum()
 
 
 def pixel_weight(

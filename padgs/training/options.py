@@ -73,6 +73,8 @@ class TrainOptions:
     """The `train` group of the configuration, without the run length (`Budget`)."""
 
     lambda_l1: float = 0.8  # lambda of Eq. 16
+    square_weight: float = 0.0  # of the squared error, added to the loss in the last 40 % of a run
+    adam_beta2: float = 0.999  # decay of Adam's second moments
     weight: str = "solid_angle"  # M of Eq. 17, see `padgs.training.loss.ROW_WEIGHTS`
     normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
     # published: for 30 000 iterations | run: for the length of this run, see `padgs.training.schedule.Pace` |
@@ -98,9 +100,10 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
+        check(self, "in [0, 1)", lambda decay: 0 <= decay < 1, "adam_beta2")
         check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES)
         check_known(self, depth_kind=DEPTH_KINDS)
-        check(self, ">= 0 and finite", lambda weight: 0 <= weight < math.inf, "depth_weight")
+        check(self, ">= 0 and finite", lambda weight: 0 <= weight < math.inf, "depth_weight", "square_weight")
         check_known(self, poses=(GIVEN, *POSE_RATES), lens=LENSES)
         if isinstance(self.learning_rates, str):
             check_known(self, learning_rates=LEARNING_RATES)

@@ -13,7 +13,14 @@ from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama
 from padgs.scene import Scene, View
-from padgs.training.loss import MEASURED, inverse_range_loss, photometric_loss, pixel_weight
+from padgs.training.loss import (
+    MEASURED,
+    SQUARES_SHARE,
+    inverse_range_loss,
+    photometric_loss,
+    pixel_weight,
+    squared_error,
+)
 from padgs.training.model import State
 
 if TYPE_CHECKING:
@@ -31,9 +38,14 @@ class Target:
     weight: Tensor  # [H, W] or [H, 1]
     depth: Tensor | None = None  # [H, W] as in `View.load_depth`, if it is used
 
-    def loss(self, image: Tensor, depth: Tensor, options: TrainOptions, unit: float) -> Tensor:
-        """Return the loss of an image [H, W, 3] and its depth [H, W], a scalar; `unit` is the scene scale."""
+    def loss(self, image: Tensor, depth: Tensor, options: TrainOptions, unit: float, progress: float) -> Tensor:
+        """Return the loss of an image [H, W, 3] and its depth [H, W] at a share of the run, a scalar.
+
+        `unit` is the scene scale.
+        """
         loss = photometric_loss(image, self.image, self.weight, options.lambda_l1, normalisation=options.normalisation)
+        if options.square_weight > 0 and progress > 1 - SQUARES_SHARE:
+            loss = loss + options.square_weight * squared_error(image, self.image, self.weight)
         if self.depth is None:
             return loss
         more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)

@@ -6,7 +6,8 @@ import torch
 
 import padgs.training.targets
 from padgs.scene import Scene, View
-from padgs.training.targets import Targets, TrainingViews
+from padgs.training.options import TrainOptions
+from padgs.training.targets import Target, Targets, TrainingViews
 
 PIXELS = torch.arange(96, dtype=torch.uint8).reshape(4, 8, 3)
 
@@ -52,3 +53,17 @@ def test_views_are_drawn_by_their_share():
     assert abs(drawn[2] - 500) < 80 and abs(drawn[3] - 100) < 45, "within 4 standard deviations"
     alone = TrainingViews(Scene("s", views[3:], (), torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), ""))
     assert alone.next(1.0)[0] == 0
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_squared_errors_count_at_the_end_of_a_run(generator, masked):
+    image, target = torch.rand(2, 16, 32, 3, generator=generator).unbind()
+    weight = torch.rand(16, 32 if masked else 1, generator=generator)
+    if masked:
+        weight[:, :5], image[:, :5] = 0.0, 7.0
+    options, plain = TrainOptions(square_weight=3.0), TrainOptions()
+    found = Target(target, weight)
+    loss = [found.loss(image, image[..., 0], plain, 1.0, 1.0).item()]
+    loss += [found.loss(image, image[..., 0], options, 1.0, progress).item() for progress in (0.6, 0.61, 1.0)]
+    squares = (weight[..., None] * (image - target).square()).sum() / (3 * weight.expand(16, 32).sum())
+    assert loss[1] == loss[0] and loss[2] == loss[3] == pytest.approx(loss[0] + 3 * squares.item(), rel=1e-5)

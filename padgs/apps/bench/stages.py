@@ -39,7 +39,7 @@ NATIVE_CALLS = {
     "padgs_project": "project",
     **dict.fromkeys(("padgs_depth_order", "padgs_tile_levels", "padgs_count_instances", "padgs_bin"), "sort"),
     "padgs_blend_forward": "blend",
-    **dict.fromkeys(("padgs_angular_size", "padgs_photometric_loss", "padgs_roughness"), "loss"),
+    **dict.fromkeys(("padgs_photometric_loss", "padgs_roughness"), "loss"),
     **dict.fromkeys(("padgs_blend_backward", "padgs_sum_moments"), "blend_backward"),
     "padgs_project_backward": "project_backward",
     "padgs_decode_backward": "decode_backward",

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor
@@ -97,7 +97,7 @@ class EgoNeRFModel:
 class RayTrainer(Trainer):
     """Trainer on the mean squared error of random rays from all views; records hold the loss without regularisation."""
 
-    ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.99), "eps": 1e-8}
+    ADAM_EPS: ClassVar[float] = 1e-8
 
     def __init__(
         self,

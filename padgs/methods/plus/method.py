@@ -64,16 +64,14 @@ class PlusOptions(SplatOptions):
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # of the run, on views of half the width or less if they are large
-    size_weight: float = 0.05  # loss weight of the mean angular size: large Gaussians cost pairs in every frame
     smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces with few views, see `smoothness`
     dropout: float = 0.1  # maximal share of Gaussians dropped from a training render, see `dropout_share`
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        weights = ("size_weight", "smoothness_weight")
         thresholds = ("threshold_pixel_exponent", "threshold_full_views")
         off = "at least 0, which switches it off"
-        check(self, off, lambda value: 0 <= value < math.inf, *weights, *thresholds)
+        check(self, off, lambda value: 0 <= value < math.inf, "smoothness_weight", *thresholds)
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "dropout")
         for field in fields(DensificationOptions):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from padgs.gaussians import Gaussians
 from padgs.methods.plus.smoothness import roughness
@@ -17,8 +15,6 @@ from padgs.methods.splats.importance import GROWN_PER_KEPT
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of, finest_pixels, smoothed_for_view
 from padgs.methods.splats.splats import TINY, Splats
-from padgs.native import cpu
-from padgs.native.abi import AngularSizeArguments, pointer
 from padgs.render import RenderConfig
 from padgs.scene import View
 from padgs.training.model import State, TrainingRender
@@ -52,16 +48,13 @@ class PlusModel(SplatModel):
         return int(iteration / (DEGREE_SHARE * self.iterations))
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
-        """Render all Gaussians, differentiably, with penalties on large Gaussians and rough surfaces."""
-        drawing, options, penalties = super().draw(view, mean_offsets), self.options, []
-        # `near` may be 0, and so is the depth of empty pixels.
-        near = max(self.render_options(view).near, TINY * self.splats.scene_scale)
-        if options.size_weight > 0:
-            penalties.append(options.size_weight * mean_angular_size(drawing.gaussians, view, near=near))
-        if self._smoothness > 0:
-            far = SMOOTH_UP_TO * self.splats.scene_scale
-            penalties.append(self._smoothness * roughness(drawing.rendering, view.camera, near=near, far=far))
-        return replace(drawing, penalty=sum(penalties)) if penalties else drawing
+        """Render all Gaussians, differentiably, with a penalty on rough surfaces if views are few."""
+        drawing, unit = super().draw(view, mean_offsets), self.splats.scene_scale
+        if self._smoothness == 0:
+            return drawing
+        near = max(self.render_options(view).near, TINY * unit)  # it may be 0, and so is the depth of empty pixels
+        rough = roughness(drawing.rendering, view.camera, near=near, far=SMOOTH_UP_TO * unit)
+        return replace(drawing, penalty=self._smoothness * rough)
 
     def _training_gaussians(self, gaussians: Gaussians) -> Gaussians:
         factors, gaussians = self._dropout(), super()._training_gaussians(gaussians)
@@ -126,36 +119,3 @@ def _hashed(seed: int, count: int, device: torch.device) -> Tensor:
         mixed = mixed * factor & 0xFFFFFFFF
         mixed = mixed ^ (mixed >> shift)
     return mixed
-
-
-def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tensor:
-    """Return the mean of scale / distance over Gaussians and axes, a scalar; differentiable by the scales only.
-
-    Large Gaussians cost (Gaussian, tile) pairs in every frame. On the CPU this is one native call
-    (csrc/cpu/angular_size.cpp).
-
-    Args:
-        gaussians: at least one.
-        view: whose camera distances are measured from.
-        near: > 0, lower limit of distances, world units.
-    """
-    means, center = gaussians.means.detach(), view.center.detach().to(gaussians.means)
-    if means.device.type == "cpu" and means.dtype == torch.float32 and cpu.available():
-        return _AngularSize.apply(gaussians.scales, means, center, near)
-    distances = (means - center).norm(dim=-1).clamp(min=near)
-    return (gaussians.scales / distances[:, None]).mean()
-
-
-class _AngularSize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, scales: Tensor, means: Tensor, center: Tensor, near: float) -> Tensor:
-        scales, means = scales.contiguous(), means.contiguous()
-        ctx.gradient = torch.empty_like(scales) if ctx.needs_input_grad[0] else None
-        scalars = (len(means), (ctypes.c_float * 3)(*center.tolist()), near)
-        arguments = AngularSizeArguments(*scalars, *map(pointer, (means, scales, ctx.gradient)))
-        return scales.new_tensor(cpu.library().padgs_angular_size(ctypes.byref(arguments)))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_size: Tensor):
-        return ctx.gradient * grad_size, None, None, None

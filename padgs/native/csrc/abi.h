@@ -193,12 +193,4 @@ struct SplatArguments {
   float *grad_means, *grad_log_scales, *grad_opacity_logits, *grad_dc, *grad_rest, *grad_offsets;
 };
 
-// Arguments of padgs.methods.plus.model.mean_angular_size.
-struct AngularSizeArguments {
-  int64_t count;
-  float center[3], nearest;     // camera centre; lower limit of distances; world units
-  const float *means, *scales;  // [N,3]
-  float *gradient;              // [N,3], by scales, or null
-};
-
 }  // namespace padgs

@@ -170,7 +170,8 @@ def test_training_is_invariant_to_world_units():
         records = list(PlusMethod(OPTIONS).fit(in_other_units(tiny_scene(), scale), Budget(32)))
         losses.append([record.loss for record in records])
         assert records[-1].counts["gaussians"] > records[0].counts["gaussians"]
-    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+    # Rounding decides which axis of a round Gaussian is the longest.
+    assert losses[1] == pytest.approx(losses[0], rel=0.01)
 
 
 def test_initial_number_and_limit_are_multiples_of_the_pixels():
@@ -184,21 +185,22 @@ def test_initial_number_and_limit_are_multiples_of_the_pixels():
     assert max(counts) > counts[0]
 
 
-def test_penalties_are_the_mean_angular_size_and_the_roughness_of_the_render():
-    view = tiny_scene().train[1]
-    for size_weight, smoothness_weight in ((0.7, 0.0), (0.0, 0.3)):
-        weights = {"size_weight": size_weight, "smoothness_weight": smoothness_weight}
-        method = PlusMethod(replace(OPTIONS, **weights))
-        next(method.fit(tiny_scene(), Budget(10)))
-        splats, drawing = method.model.splats, method.model.draw(view)
-        angles = torch.exp(splats.log_scales) / (splats.means - view.center).norm(dim=-1, keepdim=True)
-        rough = roughness(drawing.rendering, view.camera, near=method.model.render_options(view).near).item()
-        expected = size_weight * angles.mean().item() + smoothness_weight * rough
-        assert drawing.penalty.item() == pytest.approx(expected) and rough > 0
-        drawing.penalty.backward()
-        moves = splats.means.grad is not None and bool(splats.means.grad.any())
-        assert moves == (smoothness_weight > 0), "the size penalty must not push Gaussians away"
-        assert splats.log_scales.grad.any()
+@pytest.mark.parametrize(
+    ("views", "weight"), [(3, 0.3), (8, 0.3), (11, 0.3 * math.log2(16 / 11)), (16, 0.0), (40, 0.0)]
+)
+def test_the_smoothness_prior_is_for_few_views(views, weight):
+    assert replace(OPTIONS, smoothness_weight=0.3).smoothness(views) == pytest.approx(weight)
+
+
+def test_penalty_is_the_roughness_of_the_render():
+    view, method = tiny_scene().train[1], PlusMethod(replace(OPTIONS, smoothness_weight=0.3))
+    next(method.fit(tiny_scene(), Budget(10)))
+    splats, drawing = method.model.splats, method.model.draw(view)
+    near, far = method.model.render_options(view).near, 4 * splats.scene_scale
+    rough = roughness(drawing.rendering, view.camera, near=near, far=far).item()
+    assert drawing.penalty.item() == pytest.approx(0.3 * rough) and rough > 0
+    drawing.penalty.backward()
+    assert splats.means.grad.any()
 
 
 def test_empty_pixels_have_a_finite_penalty_with_near_0():

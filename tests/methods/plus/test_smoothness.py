@@ -1,23 +1,16 @@
-"""Penalties of padgs_plus: roughness of surfaces and mean angular size."""
+"""The smoothness prior of padgs_plus."""
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole, perspective
-from padgs.methods.plus import model, smoothness
-from padgs.methods.plus.model import mean_angular_size
+from padgs.methods.plus import smoothness
 from padgs.methods.plus.smoothness import MAX_BEND, fits_native, roughness
 from padgs.native import cpu
 from padgs.render import Rendering
-from padgs.scene import View
 
 needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 
@@ -158,57 +151,3 @@ def test_unsupported_tensors_use_the_definition():
     )
     strided = replace(drawn, depth=drawn.depth.T.contiguous().T)
     assert roughness(strided, camera, near=1e-3) == roughness(drawn, camera, near=1e-3)
-
-
-def gaussians_at(means: torch.Tensor, scales: torch.Tensor) -> Gaussians:
-    count = len(means)
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).to(means).expand(count, 4)
-    return Gaussians(means, quats, scales, means.new_ones(count), means.new_zeros(count, 3))
-
-
-def view_from(center: tuple[float, float, float]) -> View:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = -torch.tensor(center, dtype=torch.float64)
-    return View("v", pose, 32, 16)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e6])
-def test_angular_size_is_scale_over_distance_limited_by_near(dtype, unit):
-    means = unit * torch.tensor([[1.0, 0.0, 4.0], [1.0, 2.0, 0.0], [1.0, 0.0, 0.001]], dtype=dtype)
-    scales = unit * torch.tensor([[0.4, 0.2, 0.6], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3]], dtype=dtype)
-    found = mean_angular_size(gaussians_at(means, scales), view_from((unit, 0.0, 0.0)), near=0.5 * unit)
-    assert found.item() == pytest.approx((0.1 + 0.05 + 0.6) / 3, rel=1e-6)
-
-
-@needs_native
-@pytest.mark.parametrize("count", [1, 16, 1000, 3000])
-def test_native_angular_size_matches_the_definition(monkeypatch, generator, count):
-    means, scales = torch.randn(count, 3, generator=generator), torch.rand(count, 3, generator=generator)
-    for values in (means, scales):
-        broken = values.clone()
-        broken[-1, 1] = math.nan
-        pair = (broken, scales) if values is means else (means, broken)
-        assert mean_angular_size(gaussians_at(*pair), view_from((0.0, 0.0, 0.0)), near=0.1).isnan()
-    found = []
-    for native in (True, False):
-        monkeypatch.setattr(model.cpu, "available", lambda native=native: native)
-        leaf = scales.clone().requires_grad_()
-        size = mean_angular_size(gaussians_at(means, leaf), view_from((0.1, 0.2, 0.3)), near=0.2)
-        found.append((size.item(), *torch.autograd.grad(3 * size, leaf)))
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
-    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-5, atol=0.0)
-
-
-def test_no_instruction_set_hides_nan():
-    """Which of two numbers a maximum takes, if one is none, differs between them; this machine's own is above."""
-    code = (
-        "import torch; from test_smoothness import gaussians_at, view_from, mean_angular_size as size; "
-        "means = torch.full((20, 3), float('nan')); "
-        "print(size(gaussians_at(means, torch.ones(20, 3)), view_from((0.0, 0.0, 0.0)), near=0.1).item())"
-    )
-    for isa in ("baseline", "avx2"):
-        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-        environment = {**os.environ, "PYTHONPATH": path, "PADGS_ISA": isa}
-        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-        assert done.stdout.strip() == "nan", done.stderr

@@ -13,7 +13,6 @@ namespace padgs {
   extern const HybridKernels hybrid_kernels;  \
   extern const LeaveOneOutKernels leave_one_out_kernels; \
   extern const SplatKernels splat_kernels;    \
-  extern const AngularSizeKernels angular_size_kernels; \
   extern const LossKernels loss_kernels;      \
   extern const RoughnessKernels roughness_kernels; \
   extern const DecodeKernels decode_kernels;  \
@@ -32,7 +31,6 @@ struct Kernels {
   const HybridKernels &hybrid;
   const LeaveOneOutKernels &leave_one_out;
   const SplatKernels &splats;
-  const AngularSizeKernels &angular_size;
   const LossKernels &loss;
   const RoughnessKernels &roughness;
   const DecodeKernels &decode;
@@ -41,8 +39,8 @@ struct Kernels {
 
 #define PADGS_KERNELS(isa)                                                                                      \
   {#isa,                       isa::project_kernels, isa::blend_kernels,        isa::hybrid_kernels,             \
-   isa::leave_one_out_kernels, isa::splat_kernels,   isa::angular_size_kernels, isa::loss_kernels,               \
-   isa::roughness_kernels,     isa::decode_kernels,  isa::ceiling_kernels}
+   isa::leave_one_out_kernels, isa::splat_kernels,   isa::loss_kernels,         isa::roughness_kernels,          \
+   isa::decode_kernels,        isa::ceiling_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -73,7 +71,7 @@ using namespace padgs;
 PADGS_API int64_t padgs_structure_bytes(int32_t index) {
   const size_t bytes[] = {sizeof(Camera), sizeof(Inputs), sizeof(Gradients), sizeof(BlendGradientArguments),
                           sizeof(DecodeGradientArguments), sizeof(LossArguments), sizeof(SplatArguments),
-                          sizeof(LeaveOneOutArguments), sizeof(RoughnessArguments), sizeof(AngularSizeArguments)};
+                          sizeof(LeaveOneOutArguments), sizeof(RoughnessArguments)};
   return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
 }
 
@@ -107,8 +105,6 @@ PADGS_API int64_t padgs_core_words(const BlendArguments *args) { return kernels(
 PADGS_API void padgs_leave_one_out(const LeaveOneOutArguments *args) { kernels().leave_one_out.run(*args); }
 
 PADGS_API void padgs_splats(const SplatArguments *args) { kernels().splats.run(*args); }
-
-PADGS_API double padgs_angular_size(const AngularSizeArguments *args) { return kernels().angular_size.run(*args); }
 
 PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kernels().loss.photometric(*args); }
 

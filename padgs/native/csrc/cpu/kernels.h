@@ -27,10 +27,6 @@ struct SplatKernels {
   void (*run)(const SplatArguments &);
 };
 
-struct AngularSizeKernels {
-  double (*run)(const AngularSizeArguments &);
-};
-
 struct LossKernels {
   double (*photometric)(const LossArguments &);
   int64_t (*workspace)(int32_t height, int32_t width);
