@@ -1,9 +1,8 @@
 """padgs_plus: the method of this project, each part chosen by measurement (docs/plus.md).
 
-Explicit Gaussians, rendered exactly along each ray, are densified in eight rounds by their gradient in space, pruned by
-importance in a ninth, and kept small as seen from the cameras. No constant is in world units, numbers follow the pixels
-of the images, and latitude is no special case. Each part is an option that can be switched off
-(`+experiment=plus_ablation`).
+Explicit Gaussians, rendered exactly along each ray, are densified in eight rounds, half of the new ones at pixels that
+are rendered wrong, and pruned by importance in a ninth. No constant is in world units, numbers follow the pixels of the
+images, and latitude is no special case. Each part is an option that can be switched off (`+experiment=plus_ablation`).
 
 The number of Gaussians: `SplatMethod.build_model` sets the initial number and the limit,
 `padgs.methods.splats.densification` adds Gaussians above a threshold, `padgs.methods.splats.importance` prunes them.
@@ -55,8 +54,8 @@ class PlusOptions(SplatOptions):
     split: str = "long_axis"
     error_share: float = 0.5
     min_opacity: float = 0.05  # fainter Gaussians are pruned after each round
-    initial_per_pixel: float | None = 0.6
-    depth_init_per_pixel: float = 0.6
+    initial_per_pixel: float | None = 0.4
+    depth_init_per_pixel: float = 0.4
     sky_per_point: float = 0.5
     initial_opacity: float = 0.5
     initial_scale: float = 0.6
@@ -132,7 +131,7 @@ class PlusMethod(SplatMethod):
     Options = PlusOptions
     MODEL = PlusModel
     RENDER = RenderConfig(projection="ray", low_pass=PIXEL_VARIANCE)
-    TRAIN = TrainOptions(weight="solid_angle")
+    TRAIN = TrainOptions(weight="solid_angle", square_weight=20.0, adam_beta2=0.99)
 
     @property
     def has_smoothing_filter(self) -> bool:
