@@ -53,7 +53,9 @@ def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     paper = composed("method=padgs")
     assert paper.options == PaDGSMethodOptions() and paper.render == RenderConfig()
     assert config.run == RunOptions() and config.tracking == TrackingOptions()
-    assert replace(config.train, iterations=1) == TrainConfig(iterations=1)
+    assert replace(paper.train, iterations=1) == TrainConfig(iterations=1)
+    of_plus = {name: getattr(PlusMethod.TRAIN, name) for name in vars(PlusMethod.TRAIN)}
+    assert replace(config.train, iterations=1) == TrainConfig(iterations=1, **of_plus)
     assert config.protocols == {name: PROTOCOLS[name] for name in ("paper", "sphere")}
     assert config.data.path is None and config.data.generator == {"scene": "room"}
 
