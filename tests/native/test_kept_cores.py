@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.render_cases import gaussians_of, identity_pose, leaves, needs_native
-from test_hybrid_rendering import each_native_engine, options_of
+from support.render_cases import each_native_engine, gaussians_of, identity_pose, leaves, needs_native
+from test_hybrid_rendering import options_of
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
