@@ -10,8 +10,6 @@ others approximate it. The error of a footprint is the integral over the sphere 
 integral of the truth. Without low-pass and without the cut at 1/255: the error of the projection alone.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

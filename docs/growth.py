@@ -7,8 +7,6 @@ small sizes and writes nothing. Gaussians lie on the walls of a cube, as large a
 panoramas are noise; every size has a process of its own, whose memory is counted above that of the smallest size.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import statistics

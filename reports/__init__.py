@@ -6,8 +6,6 @@ request) that returns a `Table`, a list of `Chart`s or a page; `writers` turns t
 `tables.yaml`, and `build` makes them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

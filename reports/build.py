@@ -1,7 +1,5 @@
 """Builder of the tables in `tables.yaml`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

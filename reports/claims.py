@@ -1,7 +1,5 @@
 """Tests of the claims in `claims.yaml`: paired t-tests on runs, and a page with the answer first."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

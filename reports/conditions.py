@@ -1,7 +1,5 @@
 """Conditions under which numbers were made: shared within a block, named below a table, and decisive for ranking."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 

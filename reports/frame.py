@@ -5,8 +5,6 @@ Columns: identity of a run (`place`, `preset`, `variant`, `seed`, ...) and its s
 each key of its configuration (`config.train.iterations`), None where missing.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Numbers of runs that reports compare, with their columns and the paper's names for them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

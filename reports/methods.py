@@ -1,7 +1,5 @@
 """Titles, colours and order of methods and presets (`methods.yaml`): the paper's, then the others."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from functools import cache

@@ -1,7 +1,5 @@
 """Numbers of the paper's Tables 1-4 (`baselines/published.csv`), and the scenes that tables are about."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

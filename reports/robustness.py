@@ -5,8 +5,6 @@ that of one colour for the whole image, and Q0 and Q1_0 are those of the same ru
 has 0.
 """
 
-from __future__ import annotations
-
 import ast
 import math
 from collections.abc import Callable, Mapping, Sequence, Set

@@ -1,7 +1,5 @@
 """Runs for a report: the request, the settings among the runs, and what happens to runs that must not be mixed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase

@@ -1,7 +1,5 @@
 """Cells from runs (mean and standard deviation over seeds), and significant differences between cells."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Mapping, Sequence

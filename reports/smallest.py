@@ -1,7 +1,5 @@
 """Smallest models of a quality (`padgs smallest`): a table, and charts of quality over Gaussians, bytes and time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tables as data (`tables.yaml`): runs, rows, blocks, columns and notes of each. `padgs.reports.build` makes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ A line is the content of the `result.json` with its digest, and under `log` the 
 Pictures are not stored.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Files of a report: Markdown, LaTeX and CSV of tables, PNG, SVG and CSV of charts, and pages."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence

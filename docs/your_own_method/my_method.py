@@ -1,7 +1,5 @@
 """Example of a method in another package, without Gaussians: a panorama that is infinitely far away."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

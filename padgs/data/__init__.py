@@ -3,8 +3,6 @@
 `load(path)` detects the format; `Scene.notes` says what was decided and why.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path

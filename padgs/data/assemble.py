@@ -1,7 +1,5 @@
 """Build a scene from a capture: find and check its images, split, mask, and compute the fingerprint."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Camera paths: statistics of poses, and paths through a scene. Poses are cam_from_world [F, 4, 4] float64."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Checks of a data set: everything that is wrong with it, reported at once; and an image of its points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

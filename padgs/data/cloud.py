@@ -1,7 +1,5 @@
 """Point clouds: PLY files through plyfile, and the cloud from which training starts."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 from typing import Any

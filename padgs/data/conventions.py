@@ -5,8 +5,6 @@ their reprojection error. Otherwise the colours of points are compared with the 
 strongly only if axes, handedness and direction of the poses are right, even if some points are hidden.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Their licences do not allow redistribution. Source: section 4.1 of the PaD-GS paper, and the authors' pages.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

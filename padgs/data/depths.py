@@ -4,8 +4,6 @@
 `depth.json`, as `padgs render --depth` writes it: {"measure": a key of MEASURES, "unit": world units of one step}.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -3,8 +3,6 @@
 They are read and applied, or the file is refused with a remedy; none is ignored. Pixels of a mask are no colours.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

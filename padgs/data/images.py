@@ -4,8 +4,6 @@ A panorama is an 8-bit colour image in sRGB, twice as wide as high, stored uprig
 (`image_metadata.Crop`) is padded. Other files are refused when the scene is loaded, before any training.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 `data.mask=inverted` (or inverted:FOLDER) reads files in which 255 marks what to ignore.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence

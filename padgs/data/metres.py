@@ -3,8 +3,6 @@
 `to_metres` finds the similarity that maps a world to metres; `write_unit` states the unit beside a data set.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Interpolation is on demand and cached in the panorama's `padgs.data.store`. It i
 masked pixels it is bilinear and weighted by the mask, so that masked colours reach no view.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

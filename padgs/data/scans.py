@@ -1,7 +1,5 @@
 """Point clouds of scanners: LAS, LAZ and E57, through laspy and pye57, which `padgs[scanners]` installs."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Split of the views into training and test views: by list files, or every k-th view."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath

@@ -1,7 +1,5 @@
 """Charts of quality over the number of Gaussians (`+experiment=capacity`), a curve for each method."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import cycle
 

@@ -1,7 +1,5 @@
 """Style, axes and labels of charts, one colour per method, and the formats PNG and SVG."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Callable, Sequence

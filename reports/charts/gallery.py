@@ -1,7 +1,5 @@
 """A test view of each scene: the ground truth, and the render of each method above its error."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

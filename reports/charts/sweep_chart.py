@@ -1,7 +1,5 @@
 """Charts of sweeps: each quantity over the key that was swept, a curve per scene and preset, bars over seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

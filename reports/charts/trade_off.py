@@ -1,7 +1,5 @@
 """Speed against accuracy: a point per method and setting of a scene, or mean over finished scenes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace

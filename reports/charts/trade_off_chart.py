@@ -1,7 +1,5 @@
 """Charts of speed against accuracy: quality over training time and over time per frame, and over time from the logs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """All reports in one file that needs no network: tables that sort, charts, test views and a 360° viewer."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

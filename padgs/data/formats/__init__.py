@@ -1,7 +1,5 @@
 """Readers and writers of data set formats: one `read(path, options) -> Capture` each. `detect` chooses."""
 
-from __future__ import annotations
-
 from fnmatch import fnmatch
 from pathlib import Path
 

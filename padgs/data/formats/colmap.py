@@ -4,8 +4,6 @@ COLMAP's panoramic camera has the axes of `padgs.geometry.panorama`, so poses ar
 file, which all versions write.
 """
 
-from __future__ import annotations
-
 import signal
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of COLMAP models, text and binary. Source: the description of COLMAP's output format, 3.x and 4.x."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Conversion between formats: read and check everything, write to a temporary folder, then rename it."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """E57 files of scanners with panoramas and their poses, as `padgs.data.formats.poses.cam_from_panorama`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

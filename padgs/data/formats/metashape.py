@@ -5,8 +5,6 @@ The transform of a camera is its pose in its component: 16 numbers, row by row, 
 world = chunk x component x camera. A file without any of them is in the chunk's own frame, whose scale is arbitrary.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """NavVis' `pano-poses.csv`: the pose of each panorama in the world, as `padgs.data.formats.poses.cam_from_panorama`."""
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

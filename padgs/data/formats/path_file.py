@@ -6,8 +6,6 @@ right, y up, z backward) in a normalised world, which the run's `dataparser_tran
 beside the path.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 Matrices that are not rotations are refused, because slightly wrong poses silently cost quality.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

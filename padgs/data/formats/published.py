@@ -18,8 +18,6 @@ pixels, 0 = unknown), and poses.txt with a line "frame x y z qx qy qz qw" each: 
 body that looks along x. The middle of a panorama shows the left of the body. There are no points and no split.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

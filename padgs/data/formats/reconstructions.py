@@ -6,8 +6,6 @@ train.txt and test.txt; image sizes are not stated. OpenSfM: `reconstruction.jso
 translation of cam_from_world in each shot.
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Poses are world from camera, with OpenGL axes: x right, y up, z backward.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 

@@ -1,7 +1,5 @@
 """Writers of formats: the files beside the images."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A condition is a function of `geometry` or `images` with the decorator `condition`, which has levels, limits and text.
 """
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Stress conditions: functions scene -> scene with a name, three levels and the sentence of the docs."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Test views keep the poses that their images were taken at.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -4,8 +4,6 @@ Test views change too where the world (`textureless`) or all cameras (`seam`, `p
 the capture is in training views alone. Pixels are changed at each loading, so the times of such runs mean nothing.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace

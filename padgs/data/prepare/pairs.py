@@ -1,7 +1,5 @@
 """Pairs of panoramas to match: all of a few; of many those taken one after the other, and those that look alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path

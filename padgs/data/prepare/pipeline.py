@@ -4,8 +4,6 @@ Works in a hidden folder beside the destination, so that an interrupted call can
 when it is complete.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ Three rows of four 90-degree views at latitudes -35, 0 and 35 degrees. Every dir
 nearest centre, so that no feature is found twice. The views have the panorama's resolution at its horizon.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

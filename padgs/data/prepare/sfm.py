@@ -4,8 +4,6 @@ Features and matches are computed in batches, which gives progress and resumes f
 process's standard error and ignores its own switches; `log_to` redirects that.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Input of `prepare`: a folder of panoramas with masks, or a 360-degree video, checked before any work is done."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 prepare.json, at the destination, records options and result, by which a finished preparation is recognised.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

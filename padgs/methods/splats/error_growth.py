@@ -4,8 +4,6 @@ A pixel of a training view is drawn with a probability in proportion to its erro
 put at the rendered distance, has the colour of the photograph, and is about as wide as the pixel there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 
