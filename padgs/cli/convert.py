@@ -7,8 +7,8 @@ import typer
 from padgs.cli.errors import check_range, show
 from padgs.cli.prepare import CameraHeight, Gps, Metres
 
-FORMATS = "colmap, nerfstudio (or transforms), released"
-SOURCES = "openmvg, opensfm, metashape, e57, navvis, roam360, ricoh360, omniblender, ob3d, tartanair"  # besides
+FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
+SOURCES = "metashape, e57, navvis, roam360, ricoh360, omniblender, ob3d, tartanair"  # besides
 
 
 def convert(

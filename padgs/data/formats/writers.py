@@ -1,4 +1,4 @@
-"""Writers of formats: the files beside the images."""
+"""Writers of all formats: the files beside the images."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -76,6 +76,57 @@ def write_transforms(content: Content, folder: Path) -> None:
     _write_json(folder / "transforms.json", meta)
 
 
+def write_openmvg(content: Content, folder: Path) -> None:
+    """Write `sfm_data.json`, colorized.ply for the colours, and the lists."""
+    views, extrinsics = _mvg_views(content)
+    width, height = _size(content.frames[0])
+    cereal = {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
+    intrinsic = {"id": 2147483649, "data": {"value0": {"width": width, "height": height}}}
+    cloud, tracks = content.cloud or Cloud(torch.zeros(0, 3), None), content.tracks or Tracks.from_observations([])
+    structure = [
+        {"key": key, "value": {"X": point, "observations": []}} for key, point in enumerate(cloud.points.tolist())
+    ]
+    if cloud.colors is not None:
+        write_ply(folder / "colorized.ply", cloud)
+    rows = zip(tracks.frame.tolist(), tracks.point.tolist(), tracks.pixels.tolist(), strict=True)
+    for feature, (frame, point, pixel) in enumerate(rows):
+        seen = {"key": frame, "value": {"id_feat": feature, "x": pixel}}
+        structure[point]["value"]["observations"].append(seen)
+    data = {
+        "sfm_data_version": "0.3",
+        "root_path": "images",
+        "views": views,
+        "intrinsics": [{"key": 0, "value": {**cereal, "ptr_wrapper": intrinsic}}],
+        "extrinsics": extrinsics,
+        "structure": structure,
+        "control_points": [],
+    }
+    _write_json(folder / "sfm_data.json", data)
+    _write_lists(content, folder)
+
+
+def write_opensfm(content: Content, folder: Path) -> None:
+    """Write `reconstruction.json` with one reconstruction, and the lists."""
+    from scipy.spatial.transform import Rotation
+
+    cameras, shots = {}, {}
+    for frame in content.frames:
+        width, height = _size(frame)
+        camera = f"panorama {width} {height} spherical"
+        cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
+        shots[frame.name] = {
+            "rotation": Rotation.from_matrix(frame.cam_from_world[:3, :3].numpy()).as_rotvec().tolist(),
+            "translation": frame.cam_from_world[:3, 3].tolist(),
+            "camera": camera,
+        }
+    points = {}
+    if content.cloud is not None:
+        rows = zip(content.cloud.points.tolist(), _colors(content.cloud).tolist(), strict=True)
+        points = {str(k): {"coordinates": point, "color": color} for k, (point, color) in enumerate(rows)}
+    _write_json(folder / "reconstruction.json", [{"cameras": cameras, "shots": shots, "points": points}])
+    _write_lists(content, folder)
+
+
 def write_released(content: Content, folder: Path) -> None:
     """Write data_views.json, data_extrinsics.json, pcd.ply and the lists (without extensions)."""
     views, extrinsics = _mvg_views(content)
@@ -90,6 +141,8 @@ WRITERS: dict[str, Callable[[Content, Path], None]] = {
     "colmap": write_colmap,
     "transforms": write_transforms,
     "nerfstudio": write_transforms,
+    "openmvg": write_openmvg,
+    "opensfm": write_opensfm,
     "released": write_released,
 }
 

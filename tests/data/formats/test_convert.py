@@ -55,8 +55,10 @@ def test_help_lists_the_formats_and_nerfstudio_is_one(world: World, tmp_path: Pa
 
 def test_tracks_are_converted(world: World, tmp_path: Path) -> None:
     WRITERS["colmap"](world, tmp_path / "a")
-    convert(tmp_path / "a", tmp_path / "b", "colmap", options=DataOptions(width=32))
-    before, after = read(tmp_path / "a").tracks, read(tmp_path / "b").tracks
+    convert(tmp_path / "a", tmp_path / "b", "openmvg", options=DataOptions(width=32))
+    (tmp_path / "b" / "colorized.ply").unlink()  # its points are in another order for all that openmvg promises
+    convert(tmp_path / "b", tmp_path / "c", "colmap")
+    before, after = read(tmp_path / "a").tracks, read(tmp_path / "c").tracks
     assert before is not None and after is not None
     first, last = before(), after()
     keys = [tracks.frame * 1000 + tracks.point for tracks in (first, last)]
