@@ -56,7 +56,10 @@ def test_settings_compose(command):
     arguments = [argument for argument in shlex.split(command)[1:] if argument != "-m"]
     if missing_plugin(arguments):
         pytest.skip(missing_plugin(arguments))
-    first_choices = [re.sub(r"=([^,]*),.*", r"=\1", argument) for argument in arguments]
+    # "init" names a folder of a finished run, which a reader has and this test has not.
+    first_choices = [
+        re.sub(r"=([^,]*),.*", r"=\1", argument) for argument in arguments if not argument.startswith("init=")
+    ]
     assert first_and_last_job(*first_choices)
 
 
