@@ -29,7 +29,7 @@ class Trainer:
         iteration, seconds, cpu_seconds: iterations so far, and the time they took.
         schedule: length of the schedule, in steps.
         step: last schedule step; `iteration` unless the budget is in seconds or part of the schedule was skipped.
-        step_seconds: duration of the last iteration, on the clock of the budget.
+        durations: of the last two iterations, on the clock of the budget.
         began: seconds before the first iteration, on the clock of the budget.
         start: number of Gaussians, anchors or other parts at the beginning.
         skipped, ended: schedule steps that `request_stop` skipped, and its reason.
@@ -39,18 +39,8 @@ class Trainer:
     """
 
     ADAM_EPS: ClassVar[float] = 1e-15  # as 3DGS: gradients of a Gaussian are tiny
-    PROGRESS = (
-        "iteration",
-        "step",
-        "schedule",
-        "seconds",
-        "cpu_seconds",
-        "step_seconds",
-        "began",
-        "start",
-        "skipped",
-        "ended",
-    )
+    TIMES = ("seconds", "cpu_seconds", "durations", "began")
+    PROGRESS = ("iteration", "step", "schedule", "start", "skipped", "ended", *TIMES)
 
     def __init__(
         self,
@@ -74,7 +64,8 @@ class Trainer:
         self.iteration = self.step = self.skipped = 0
         self.ended = ""
         self.schedule = budget.iterations
-        self.seconds = self.cpu_seconds = self.step_seconds = self.began = 0.0
+        self.seconds = self.cpu_seconds = self.began = 0.0
+        self.durations: list[float] = []
         self.start = next(iter(model.counts().values()))
         self._model, self._budget, self._options, self._stage = model, budget, options, stage
         self._views_each = views_each
@@ -99,7 +90,9 @@ class Trainer:
         budget, limit = self._budget, self._budget.max_seconds
         while self.step < budget.iterations and (limit is None or self.seconds < limit):
             lap, iteration = Lap(), self.iteration + 1
-            step = budget.next_step(self.step, self.spent, self.step_seconds, skipped=self.skipped, began=self.began)
+            # The shorter of two: after one long iteration, as when the machine slept, the next ones are short again.
+            expected = min(self.durations, default=0.0)
+            step = budget.next_step(self.step, self.spent, expected, skipped=self.skipped, began=self.began)
             self._monitor.begin(step, self._views.halvings(step / self.schedule), iteration)
             with out_of_memory_as_failure(iteration):
                 loss, sizes = self._gradients(iteration, step)
@@ -118,7 +111,7 @@ class Trainer:
                 events += (f"stopping: {reason}",)
             wall, cpu = lap.seconds()
             self.seconds, self.cpu_seconds = self.seconds + wall, self.cpu_seconds + cpu
-            self.step_seconds = self.spent - before
+            self.durations = [*self.durations[-1:], self.spent - before]
             progress = step / budget.iterations
             yield Record(iteration, progress, loss, self.seconds, self.cpu_seconds, {**counts, **sizes}, events)
 
@@ -154,9 +147,11 @@ class Trainer:
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
-                loss = target.loss(image, rendered.rendering.depth, options, self._unit, step / self.schedule)
+                loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
+                # Not read before: squared errors that set in are no divergence.
+                loss = loss + target.squares(image, options, step / self.schedule)
             if checked:
                 self._monitor.render(rendered, target.image, iteration)
             with stage("backward"):

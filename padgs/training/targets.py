@@ -38,18 +38,19 @@ class Target:
     weight: Tensor  # [H, W] or [H, 1]
     depth: Tensor | None = None  # [H, W] as in `View.load_depth`, if it is used
 
-    def loss(self, image: Tensor, depth: Tensor, options: TrainOptions, unit: float, progress: float) -> Tensor:
-        """Return the loss of an image [H, W, 3] and its depth [H, W] at a share of the run, a scalar.
-
-        `unit` is the scene scale.
-        """
+    def loss(self, image: Tensor, depth: Tensor, options: TrainOptions, unit: float) -> Tensor:
+        """Return the loss of an image [H, W, 3] and its depth [H, W], a scalar; `unit` is the scene scale."""
         loss = photometric_loss(image, self.image, self.weight, options.lambda_l1, normalisation=options.normalisation)
-        if options.square_weight > 0 and progress > 1 - SQUARES_SHARE:
-            loss = loss + options.square_weight * squared_error(image, self.image, self.weight)
         if self.depth is None:
             return loss
         more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
         return loss + options.depth_weight * more
+
+    def squares(self, image: Tensor, options: TrainOptions, progress: float) -> Tensor | float:
+        """Return what squared errors of an image [H, W, 3] add to the loss at a share of the run."""
+        if options.square_weight == 0 or progress <= 1 - SQUARES_SHARE:
+            return 0.0
+        return options.square_weight * squared_error(image, self.image, self.weight)
 
 
 class Targets:

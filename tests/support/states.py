@@ -4,7 +4,7 @@ import torch
 
 from padgs.training.model import State
 
-TIMES = {"seconds": 0, "cpu_seconds": 0, "step_seconds": 0, "began": 0}
+TIMES = {"seconds": 0, "cpu_seconds": 0, "durations": [], "began": 0}
 
 
 def assert_same_but_time(a: State, b: State) -> None:

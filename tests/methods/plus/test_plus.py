@@ -144,6 +144,15 @@ def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(mon
     assert_same_but_time(resumed.state(), whole.state())
 
 
+def test_one_long_iteration_does_not_end_a_run_of_seconds(monkeypatch):
+    """As when the machine sleeps, or another program has the processor for a while."""
+    ticks = count()
+    monkeypatch.setattr(clock.time, "perf_counter", lambda: (tick := next(ticks)) / 64 + (15 / 64 if tick > 30 else 0))
+    monkeypatch.setattr(clock.time, "process_time", lambda: 0.0)
+    records = list(PlusMethod(OPTIONS).fit(tiny_scene(), Budget(1, seconds=60 / 64)))
+    assert records[-1].seconds == pytest.approx(60 / 64, rel=0.05) and records[-1].progress == 1
+
+
 def test_a_limit_of_seconds_does_not_end_the_rehearsal():
     method = PlusMethod(OPTIONS)
     assert not list(method.fit(tiny_scene(), Budget(10, max_seconds=1e-4, seconds=5))), (
