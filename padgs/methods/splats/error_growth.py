@@ -27,11 +27,11 @@ class WrongPixels:
     """Candidates for new Gaussians, drawn from the last `VIEWS` rendered views.
 
     Attributes:
-        rows: [C, 8] float32: position (world), colour, standard deviation (world units), and weight of the pixel:
-            the summed error of its view over the candidates of the view.
+        rows: [C, 9] float32: position (world), colour, standard deviation (world units), weight of the pixel, and
+            number of the observation.
     """
 
-    COLUMNS = (3, 3, 1, 1)
+    COLUMNS = (3, 3, 1, 1, 1)
 
     def __init__(self, generator: torch.Generator) -> None:
         """Start without candidates; `generator` is on the CPU."""
@@ -49,20 +49,22 @@ class WrongPixels:
         if not total > 0:
             return
         shares = torch.rand(PIXELS, dtype=torch.float64, generator=self._generator).to(total)
-        pixels = torch.searchsorted(cumulative, shares * total, right=True).clamp(max=len(cumulative) - 1)
+        drawn = torch.searchsorted(cumulative, shares * total, right=True).clamp(max=len(cumulative) - 1)
+        pixels, times = drawn.unique(return_counts=True)  # twice the same Gaussian would stay the same
         rays, depth = view.camera.rays().to(image).reshape(-1, 3)[pixels], rendering.depth.flatten()[pixels, None]
         pose = view.cam_from_world.to(image)
         positions = (rays / rays.norm(dim=-1, keepdim=True) * depth - pose[:3, 3]) @ pose[:3, :3]
-        sigmas, weights = SIGMA * depth / view.camera.focal, (total / PIXELS).to(image).expand(PIXELS, 1)
-        new = torch.cat((positions, image.reshape(-1, 3)[pixels], sigmas, weights), dim=1)
-        self.rows = torch.cat((self.rows.to(new), new))[-VIEWS * PIXELS :]
+        number = self.rows[-1, -1] + 1 if len(self.rows) else 1
+        weights = torch.stack((times * total / PIXELS, torch.full_like(times, number)), dim=1).to(image)
+        new = torch.cat((positions, image.reshape(-1, 3)[pixels], SIGMA * depth / view.camera.focal, weights), dim=1)
+        self.rows = torch.cat((self.rows[self.rows[:, -1] > number - VIEWS].to(new), new))
 
     def take(self, count: int, parameters: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
         """Return rows of parameters for at most `count` new Gaussians, by weight, and forget all candidates."""
-        weights = self.rows[:, -1].double().cpu()
+        weights = self.rows[:, -2].double().cpu()
         count = min(count, int((weights > 0).sum()))
         chosen = torch.multinomial(weights, count, generator=self._generator) if count > 0 else torch.zeros(0).long()
-        positions, colors, sigmas, _ = self.rows[chosen.to(self.rows.device)].split(self.COLUMNS, dim=1)
+        positions, colors, sigmas, *_ = self.rows[chosen.to(self.rows.device)].split(self.COLUMNS, dim=1)
         new = {name: value.new_zeros(count, *value.shape[1:]) for name, value in parameters.items()}
         new["means"], new["log_scales"] = positions, sigmas.log().expand(-1, 3)
         new["quats"][:, 0] = 1.0

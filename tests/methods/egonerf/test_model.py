@@ -1,6 +1,7 @@
 """Training on random rays."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,7 +21,8 @@ class Flat:
 
     def __init__(self, rays_at_once: int = 1000, penalty: float = 0.0) -> None:
         self.color = nn.Parameter(torch.full((3,), 0.2))
-        self.rays_at_once, self.penalty = rays_at_once, penalty
+        self.field = SimpleNamespace(options=SimpleNamespace(rays_at_once=rays_at_once))
+        self.penalty = penalty
         self.passes: list[int] = []
 
     def groups(self) -> list[ParameterGroup]:
