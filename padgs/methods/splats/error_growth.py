@@ -54,8 +54,10 @@ class WrongPixels:
         rays, depth = view.camera.rays().to(image).reshape(-1, 3)[pixels], rendering.depth.flatten()[pixels, None]
         pose = view.cam_from_world.to(image)
         positions = (rays / rays.norm(dim=-1, keepdim=True) * depth - pose[:3, 3]) @ pose[:3, :3]
-        number = self.rows[-1, -1] + 1 if len(self.rows) else 1
-        weights = torch.stack((times * total / PIXELS, torch.full_like(times, number)), dim=1).to(image)
+        number = 1 + (float(self.rows[-1, -1]) if len(self.rows) else 0.0)
+        weights = torch.stack((times * total / PIXELS, torch.full_like(times, number, dtype=torch.float64)), dim=1).to(
+            image
+        )
         new = torch.cat((positions, image.reshape(-1, 3)[pixels], SIGMA * depth / view.camera.focal, weights), dim=1)
         self.rows = torch.cat((self.rows[self.rows[:, -1] > number - VIEWS].to(new), new))
 
