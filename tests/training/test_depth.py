@@ -73,7 +73,8 @@ def test_depth_maps_pull_depth_and_count_nothing_when_switched_off():
         views = [(method.render(view).depth, depth_of(view)) for view in scene.train]
         errors.append(sum(inverse_range_loss(*pair, EVEN, scene.scale).item() for pair in views))
     assert errors[1] < 0.7 * errors[0]
-    without = PlusMethod(PlusOptions(depth_init_per_pixel=0.0)).fit(tiny_scene(), Budget(30))
+    plain = PlusMethod(PlusOptions(depth_init_per_pixel=0.0), train=TrainOptions())
+    without = plain.fit(tiny_scene(), Budget(30))
     assert losses[0] == [record.loss for record in without]
 
 
