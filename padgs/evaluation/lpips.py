@@ -104,6 +104,8 @@ class LPIPS(nn.Module):
             raise LpipsUnavailable(
                 f"LPIPS {self.network.name} needs at least {smallest} pixels per side; image is {width}x{height}"
             )
+        if inputs not in INPUTS:
+            raise ValueError(f"unknown LPIPS input {inputs!r}; known: {', '.join(INPUTS)} ([-1, 1] and [0, 1])")
         fed = (2 * image - 1, 2 * target - 1) if inputs == "11" else (image, target)
         shift, scale = image.new_tensor(CHANNEL_SHIFT), image.new_tensor(CHANNEL_SCALE)
         a, b = (((values - shift) / scale).permute(2, 0, 1)[None] for values in fed)
@@ -164,6 +166,8 @@ def lpips(
 
 def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
     """Return the LPIPS network of a name in `NETS`, loaded once per device; LpipsUnavailable names a way out."""
+    if net not in NETS:
+        raise ValueError(f"unknown LPIPS network {net!r}; known: {', '.join(NETS)}")
     loaded = _load(net, torch.device(device))
     if isinstance(loaded, LPIPS):
         return loaded

@@ -47,6 +47,8 @@ def photometric_loss(
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
     """
+    if normalisation not in NORMALISATIONS:
+        raise ValueError(f"unknown normalisation {normalisation!r}; known: {', '.join(NORMALISATIONS)}")
     height, width, channels = image.shape
     if weight.shape == (height, width):  # with a mask
         visible, filling = weight[..., None] > 0, target.detach()
@@ -105,6 +107,8 @@ def pixel_weight(
 
     A ValueError says that the mask leaves no pixel.
     """
+    if name not in ROW_WEIGHTS:
+        raise ValueError(f"unknown weight {name!r}; known: {', '.join(ROW_WEIGHTS)}")
     rows = ROW_WEIGHTS[name](height, dtype=dtype, device=device)[:, None]
     if mask is None:
         return rows
@@ -157,8 +161,14 @@ def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda
 
     Arguments are as in `photometric_loss`; the weighted sum over pixels and channels is divided by `total`, a scalar.
     """
-    assert (target.shape, target.dtype) == (image.shape, image.dtype), "the library gets bare pointers"
-    assert image.device == target.device == weight.device == total.device, "the library gets bare pointers"
+    if (target.shape, target.dtype) != (image.shape, image.dtype):  # the library gets bare pointers
+        raise ValueError(
+            f"the target is {target.dtype} of {list(target.shape)}, the image {image.dtype} of {list(image.shape)}; "
+            "give both alike"
+        )
+    devices = {str(tensor.device): None for tensor in (image, target, weight, total)}
+    if len(devices) > 1:
+        raise ValueError(f"image, target, weight and total are on {', '.join(devices)}; bring them to one device")
     return _FusedLoss.apply(image, target, weight, lambda_l1, total, EVALUATIONS[image.device.type])
 
 

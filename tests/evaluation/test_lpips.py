@@ -98,12 +98,17 @@ def test_gradients_agree_with_finite_differences(weights, generator):
     assert (image.grad * direction).sum().item() == pytest.approx(difference.item() / (2 * step), rel=1e-4)
 
 
-def test_small_images_are_refused(weights):
+def test_small_images_and_unknown_names_are_refused(weights):
+    image = torch.rand(64, 64, 3)
     for net in NETS:
         side = NETS[net].smallest_side
         assert lpips(torch.rand(side, side, 3), torch.rand(side, side, 3), net=net).item() > 0
         with pytest.raises(LpipsUnavailable, match=f"at least {side} pixels per side; image is {side + 1}x{side - 1}"):
             lpips(torch.rand(side - 1, side + 1, 3), torch.rand(side - 1, side + 1, 3), net=net)
+    with pytest.raises(ValueError, match="'squeeze'; known: alex, vgg"):
+        lpips(image, image, net="squeeze")
+    with pytest.raises(ValueError, match="'255'; known: 11, 01"):
+        lpips(image, image, inputs="255")
 
 
 def test_missing_weights_are_looked_for_once_and_the_error_says_how_to_get_them(monkeypatch):

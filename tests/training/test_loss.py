@@ -106,7 +106,12 @@ def test_rows_count_by_their_solid_angle():
     assert loss.item() == pytest.approx((rows[0] / rows.sum()).item(), rel=1e-5)
 
 
-def test_a_mask_without_a_pixel_is_refused():
+def test_wrong_options_are_named():
+    image = torch.zeros(8, 16, 3)
+    with pytest.raises(ValueError, match="known: solid_angle, uniform, end_rows"):
+        pixel_weight("sphere", 8)
+    with pytest.raises(ValueError, match="known: mean, channel_sum"):
+        photometric_loss(image, image, torch.ones(8, 1), normalisation="sum")
     with pytest.raises(ValueError, match="no pixel is left"):
         pixel_weight("uniform", 8, torch.zeros(8, 16))
 

@@ -46,6 +46,16 @@ def test_float32_goes_to_the_native_loss(monkeypatch):
     assert calls == [1]
 
 
+def test_what_is_not_alike_never_reaches_the_library():
+    image, target, _ = pair(8, 16)
+    weight = pixel_weight("uniform", 8)
+    for wrong in (target.double(), target[:4], target[..., :1]):
+        with pytest.raises(ValueError, match=r"the target is torch.float.* the image torch.float32 of \[8, 16, 3\]"):
+            loss.fused_photometric_loss(image, wrong, weight, 0.8, torch.tensor(1.0))
+    with pytest.raises(ValueError, match="image, target, weight and total are on cpu, meta; bring them to one device"):
+        loss.fused_photometric_loss(image, target, weight.to("meta"), 0.8, torch.tensor(1.0))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # the native loss takes float32 only
 def test_hidden_pixels_have_no_part_in_the_loss(dtype):
     """SSIM windows within five pixels of a mask reach behind it."""
