@@ -123,7 +123,14 @@ def test_an_edited_manifest_is_refused(tmp_path, change):
 
 
 @pytest.mark.parametrize(
-    "values", [{"iteration": -5}, {"seconds": -1.0}, {"progress": {"share": -0.5}}, {"step_seconds": math.inf}]
+    "values",
+    [
+        {"iteration": -5},
+        {"seconds": -1.0},
+        {"progress": {"share": -0.5}},
+        {"began": math.inf},
+        {"durations": [0.1, math.inf]},
+    ],
 )
 def test_impossible_values_are_refused_under_a_right_digest(tmp_path, values):
     checkpoint.save(example(), tmp_path)

@@ -28,6 +28,7 @@ MIN_DECAYED_OPACITY = 1e-6
 MAX_PIECE_OPACITY = 0.99
 POSITIONAL_GRADIENTS = ("image", "space", "space_absolute")
 SPLITS = ("random", "long_axis")
+AXIS_TIE = 1e-3  # axes that differ by a smaller share are equally long
 AXIS_STEP = 0.7  # of split="long_axis": distance of a piece from the middle, in standard deviations
 AXIS_WIDTH = 0.7  # ... and the factor on its other two standard deviations
 
@@ -216,7 +217,8 @@ class Densifier:
         """Return pairs at +- `AXIS_STEP` on the longest axis, whose variance with that of the pair is as before."""
         pieces = self._copies(split, PIECES, sampled=False)
         scales, step = torch.exp(pieces["log_scales"]), AXIS_STEP
-        axis = torch.nn.functional.one_hot(scales.argmax(-1), 3).to(scales)
+        longest = scales >= (1 - AXIS_TIE) * scales.amax(-1, keepdim=True)  # the first, whatever rounding does
+        axis = torch.nn.functional.one_hot(longest.to(scales).argmax(-1), 3).to(scales)
         sides = scales.new_tensor((step, -step)).repeat(len(scales) // PIECES)[:, None]
         rotations = rotation_matrices(pieces["quats"])
         pieces["means"] = pieces["means"] + (rotations @ (sides * axis * scales)[..., None])[..., 0]

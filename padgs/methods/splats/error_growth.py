@@ -27,11 +27,10 @@ class WrongPixels:
     """Candidates for new Gaussians, drawn from the last `VIEWS` rendered views.
 
     Attributes:
-        rows: [C, 9] float32: position (world), colour, standard deviation (world units), weight of the pixel, and
-            number of the observation.
+        rows: [C, 8] float32: position (world), colour, standard deviation (world units), and weight of the pixel.
     """
 
-    COLUMNS = (3, 3, 1, 1, 1)
+    COLUMNS = (3, 3, 1, 1)
 
     def __init__(self, generator: torch.Generator) -> None:
         """Start without candidates; `generator` is on the CPU."""
@@ -40,33 +39,36 @@ class WrongPixels:
 
     @torch.no_grad()
     def observe(self, view: View, rendering: Rendering) -> None:
-        """Draw candidates from a rendered training view; those of the oldest view go."""
+        """Draw candidates from a rendered training view; those of the oldest view go.
+
+        Errors are those of the photograph as it is, without learned exposures.
+        """
         image = image_of(view, rendering.image.device)
         error = (rendering.image - image).abs().mean(-1) * even_weight(view, image.device)
         surface = (rendering.transmittance < MAX_TRANSMITTANCE) & (rendering.depth > 0)
         cumulative = torch.where(surface, error, 0.0).double().flatten().cumsum(0)
         total = cumulative[-1]
-        if not total > 0:
-            return
-        shares = torch.rand(PIXELS, dtype=torch.float64, generator=self._generator).to(total)
-        drawn = torch.searchsorted(cumulative, shares * total, right=True).clamp(max=len(cumulative) - 1)
-        pixels, times = drawn.unique(return_counts=True)  # twice the same Gaussian would stay the same
+        shares = torch.rand(PIXELS, dtype=torch.float64, generator=self._generator).sort().values.to(total)
+        pixels = torch.searchsorted(cumulative, shares * total, right=True).clamp(max=len(cumulative) - 1)
+        # A pixel that is drawn twice counts twice, once: two equal Gaussians would stay equal. Its other rows stay with
+        # weight 0, so that rounding in one of them changes no choice of another.
+        first = pixels.diff(prepend=pixels.new_tensor([-1])) > 0
+        number = first.cumsum(0) - 1
+        times = torch.zeros_like(number).index_add(0, number, torch.ones_like(number))
+        weights = torch.where(first, times[number] * total / PIXELS, 0.0)
         rays, depth = view.camera.rays().to(image).reshape(-1, 3)[pixels], rendering.depth.flatten()[pixels, None]
         pose = view.cam_from_world.to(image)
         positions = (rays / rays.norm(dim=-1, keepdim=True) * depth - pose[:3, 3]) @ pose[:3, :3]
-        number = 1 + (float(self.rows[-1, -1]) if len(self.rows) else 0.0)
-        weights = torch.stack((times * total / PIXELS, torch.full_like(times, number, dtype=torch.float64)), dim=1).to(
-            image
-        )
-        new = torch.cat((positions, image.reshape(-1, 3)[pixels], SIGMA * depth / view.camera.focal, weights), dim=1)
-        self.rows = torch.cat((self.rows[self.rows[:, -1] > number - VIEWS].to(new), new))
+        colors, sigmas = image.reshape(-1, 3)[pixels], SIGMA * depth / view.camera.focal
+        new = torch.cat((positions, colors, sigmas, weights[:, None].to(image)), dim=1)
+        self.rows = torch.cat((self.rows.to(new), new))[-VIEWS * PIXELS :]
 
     def take(self, count: int, parameters: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
         """Return rows of parameters for at most `count` new Gaussians, by weight, and forget all candidates."""
-        weights = self.rows[:, -2].double().cpu()
+        weights = self.rows[:, -1].double().cpu()
         count = min(count, int((weights > 0).sum()))
         chosen = torch.multinomial(weights, count, generator=self._generator) if count > 0 else torch.zeros(0).long()
-        positions, colors, sigmas, *_ = self.rows[chosen.to(self.rows.device)].split(self.COLUMNS, dim=1)
+        positions, colors, sigmas, _ = self.rows[chosen.to(self.rows.device)].split(self.COLUMNS, dim=1)
         new = {name: value.new_zeros(count, *value.shape[1:]) for name, value in parameters.items()}
         new["means"], new["log_scales"] = positions, sigmas.log().expand(-1, 3)
         new["quats"][:, 0] = 1.0

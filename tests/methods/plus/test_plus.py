@@ -80,10 +80,10 @@ def test_the_most_important_gaussians_are_kept():
             before = record.counts["gaussians"]
         trained.append(method.model)
         assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
-    whole, chosen = (model.splats.means for model in trained)
+    whole, chosen = (model.splats.means for model in trained)  # pieces of one Gaussian may share a coordinate
     found = importance_scores(trained[0], tiny.train)
     assert len(whole) > before == len(chosen) == count_for_psnr(found, 44.0)
-    kept = torch.isin(whole[:, 0], chosen[:, 0])
+    kept = (whole[:, None] == chosen).all(-1).any(1)
     assert kept.sum() == len(chosen) and found.change[kept].min() >= found.change[~kept].max()
 
 
@@ -145,7 +145,7 @@ def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(mon
 
 
 def test_one_long_iteration_does_not_end_a_run_of_seconds(monkeypatch):
-    """As when the machine sleeps, or another program has the processor for a while."""
+    """One iteration is long when the machine sleeps, or another program has the processor for a while."""
     ticks = count()
     monkeypatch.setattr(clock.time, "perf_counter", lambda: (tick := next(ticks)) / 64 + (15 / 64 if tick > 30 else 0))
     monkeypatch.setattr(clock.time, "process_time", lambda: 0.0)
@@ -179,8 +179,7 @@ def test_training_is_invariant_to_world_units():
         records = list(PlusMethod(OPTIONS).fit(in_other_units(tiny_scene(), scale), Budget(32)))
         losses.append([record.loss for record in records])
         assert records[-1].counts["gaussians"] > records[0].counts["gaussians"]
-    # Rounding decides which axis of a round Gaussian is the longest.
-    assert losses[1] == pytest.approx(losses[0], rel=0.01)
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
 
 
 def test_initial_number_and_limit_are_multiples_of_the_pixels():

@@ -9,7 +9,7 @@ from padgs.gaussians import rotation_matrices
 from padgs.geometry import harmonics
 from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.methods.splats.densification import DensificationOptions, Densifier
-from padgs.methods.splats.error_growth import VIEWS, WrongPixels
+from padgs.methods.splats.error_growth import PIXELS, VIEWS, WrongPixels
 from padgs.methods.splats.splats import Splats
 from padgs.render import Rendering
 from padgs.scene import View
@@ -65,13 +65,14 @@ def test_pixels_are_drawn_by_error_and_solid_angle():
     for one in (wrong_at({(0, 1): 0.2, (3, 9): 0.2}), wrong_at({(3, 2): 0.6})):
         pixels.observe(*one)
     candidates, splats = pixels.rows, Splats(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1, 3))
+    weighted = candidates[candidates[:, -1] > 0]
     weights = torch.tensor([0.2, 0.2, 0.6]) * torch.tensor([78.75, 11.25, 11.25]).deg2rad().cos()
     expected = (weights / weights.sum()).tolist()
-    assert (candidates[:, -2] / candidates[:, -2].sum()).tolist() == pytest.approx(expected, abs=0.02)
+    assert (weighted[:, -1] / weighted[:, -1].sum()).tolist() == pytest.approx(expected, abs=0.02)
     drawn = torch.zeros(3)
     for _ in range(300):
         pixels.rows = candidates
-        drawn += (pixels.take(1, splats.rows())["means"] == candidates[:, :3]).all(-1)
+        drawn += (pixels.take(1, splats.rows())["means"] == weighted[:, :3]).all(-1)
     assert (drawn / 300).tolist() == pytest.approx(expected, abs=0.1)
 
 
@@ -84,7 +85,7 @@ def test_only_the_last_views_count():
     pixels = WrongPixels(torch.Generator().manual_seed(0))
     for number in range(VIEWS + 1):
         pixels.observe(*wrong_at({(2, 5): 0.4} if number else {(6, 1): 0.4}))
-    assert len(pixels.rows) == VIEWS
+    assert len(pixels.rows) == VIEWS * PIXELS and (pixels.rows[:, -1] > 0).sum() == VIEWS
     assert (pixels.rows[:, :3] - pixels.rows[0, :3]).abs().max() < 1e-5
 
 

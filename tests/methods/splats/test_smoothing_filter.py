@@ -12,10 +12,13 @@ from padgs.render.projection import LowPass, low_pass_filtered
 from padgs.scene import View
 from padgs.training.options import Budget
 
+# Gaussians at equal distances are blended in their order; these options leave few.
+OPTIONS = PlusOptions(initial_per_pixel=None, error_share=0.0, split="random")
+
 
 @pytest.fixture(scope="module")
 def trained():
-    method = PlusMethod(PlusOptions(initial_per_pixel=None, error_share=0.0, split="random"))
+    method = PlusMethod(OPTIONS)
     list(method.fit(tiny_scene(), Budget(20)))
     return method
 
@@ -66,7 +69,7 @@ def test_training_views_are_unchanged_and_closer_views_are_smoothed(trained):
 
 def test_the_filter_survives_loading_and_pruning(trained):
     view = close_up(tiny_scene().train[1])
-    loaded = PlusMethod(PlusOptions(initial_per_pixel=None, error_share=0.0, split="random"))
+    loaded = PlusMethod(OPTIONS)
     loaded.load_state(trained.state())
     assert torch.equal(loaded.render(view).image, trained.render(view).image)
     kept = torch.arange(len(loaded.model.splats)) % 2 == 0
