@@ -104,7 +104,8 @@ def understood(folder: Path) -> Iterator[None]:
 def _refuse_impossible(values: Mapping[str, Any]) -> None:
     """Refuse numbers that no training leaves; a digest is no signature."""
     for name, value in (*values.items(), *values.get("progress", {}).items()):
-        if isinstance(value, (int, float)) and not 0 <= value < math.inf:
+        numbers = value if isinstance(value, list) else [value]
+        if not all(0 <= number < math.inf for number in numbers if isinstance(number, (int, float))):
             raise ValueError(f"{name} is {value}; it must be at least 0 and finite")
 
 
