@@ -139,9 +139,8 @@ def test_impossible_values_are_refused_under_a_right_digest(tmp_path, values):
     del manifest["manifest_sha256"]
     manifest["manifest_sha256"] = checkpoint._digest(manifest)
     (tmp_path / "state.json").write_text(json.dumps(manifest))
-    with pytest.raises(
-        CheckpointError, match=r"is (-?[\dinf.]+|\[0\.1, inf\]); it must be at least 0 and finite.*delete the checkpoint"
-    ):
+    said = r"is (-?[\dinf.]+|\[0\.1, inf\]); it must be at least 0 and finite.*delete the checkpoint"
+    with pytest.raises(CheckpointError, match=said):
         checkpoint.load(tmp_path)
 
 
