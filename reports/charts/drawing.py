@@ -65,6 +65,7 @@ class Label:
     at: tuple[float, float]
     radius: float
     weight: str  # key of `FONT_SIZES`
+    color: str | None = None  # None: as all text
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,8 @@ def write_labels(panel: Any, labels: Sequence[Label], marks: Sequence[tuple[floa
     taken, written = np.zeros((0, 4)), []
     for label in labels:
         soft = label.weight == "faint"
-        text = figure.text(0.5, 0.5, label.text, fontsize=FONT_SIZES[label.weight], color=SOFT if soft else INK)
+        text = figure.text(0.5, 0.5, label.text, fontsize=FONT_SIZES[label.weight])
+        text.set_color(label.color or (SOFT if soft else INK))
         text.set(ha="center", va="center", linespacing=1.05, zorder=6, weight="normal" if soft else label.weight)
         extent, at, radius = text.get_window_extent(), to_pixels(label.at), label.radius * points
         boxes, costs = _candidates(at, radius, np.array([extent.width, extent.height]))

@@ -140,7 +140,7 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
         panel.plot(seconds[-1], psnr[-1], **look, marker="o", markersize=2 * END_RADIUS)
         if named.get(preset) == title:
             text = methods.short(title, preset)
-            labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role)))
+            labels.append(Label(text, (seconds[-1], psnr[-1]), END_RADIUS, weight_of(preset, role), color))
     time = "training time on the CPU" if trade_off.on_cpu else "training time"
     panel.set_xlabel(f"{time} in seconds, evaluations not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
