@@ -70,6 +70,15 @@ sitting() { echo "$(git rev-parse HEAD), $(sed -n 's/^model name[^:]*: //p' /pro
 
 refuse() { echo "error: $*" >&2; exit 1; }
 
+# End the runs of a step, which write checkpoints, then this script.
+stop() {
+  trap '' INT TERM HUP
+  kill -s INT -- "-$worker" || true
+  wait "$worker" || true
+  echo "stopped; the same command resumes" >&2
+  exit 130
+}
+
 # Take a step; return 0 if every run of it has a result.
 take() {
   local step=$1 run settings
@@ -141,8 +150,13 @@ padgs-run in $out/$step.log lists, and $out/$step.sitting, to measure it again" 
     continue
   fi
   echo "$step: about $(hours $total) h left"
+  set -m  # for a process group, to which a signal to this script alone is passed on
+  take "$step" &
+  worker=$!
+  trap stop INT TERM HUP
+  set +m
   status=0
-  take "$step" || status=$?
+  wait "$worker" || status=$?
   other=$(grep -L "\"commit\": \"$commit\"" "$out"/runs/*/result.json 2>/dev/null || true)
   if [ -n "$other" ]; then refuse "of another commit than ${commit:0:10}, remove them:" $(head -n 5 <<<"$other"); fi
   if [ $status -gt 1 ]; then echo "stopped; the same command resumes" >&2; exit $status; fi

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,7 @@ echo "$*" >> "$CALLS"
 for setting; do case $setting in run.folder=*) runs=${setting#*=} ;; esac; done
 mkdir "$runs/$$"
 echo "{\\"commit\\": \\"${FORGED:-$(git rev-parse HEAD)}\\"}" > "$runs/$$/result.json"
+if [ -n "$WAIT" ]; then sleep "$WAIT"; fi
 echo "3 of 4 done, ${FAILED:-1 failed (nan)}"
 exit ${STATUS:-1}
 """
@@ -76,6 +79,19 @@ def test_a_stopped_step_is_resumed_and_one_without_all_results_tried_again(measu
     code, output, calls = measure("J-court", FAILED="1 failed (refused)")
     assert (code, len(calls)) == (1, 1) and "runs without a result in J-court" in output
     assert measure("J-court")[0] == 0
+
+
+def test_a_signal_to_the_script_alone_ends_its_runs_and_it_resumes(measure, tmp_path):
+    settings = {**os.environ, "BIN": "bin", "CALLS": str(tmp_path / "build/calls"), "WAIT": "60"}
+    script = tmp_path / "reports" / SCRIPT.name
+    started = subprocess.Popen([script, "J-court"], env=settings, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    while not list(tmp_path.glob("build/campaign/runs/*/result.json")):
+        time.sleep(0.05)
+    started.terminate()
+    output, _ = started.communicate(timeout=30)
+    assert started.returncode == 130 and b"the same command resumes" in output
+    code, output, calls = measure("J-court")
+    assert (code, len(calls)) == (0, 2), output
 
 
 def test_another_commit_or_sitting_or_a_changed_file_is_refused(measure, tmp_path):
