@@ -45,9 +45,8 @@ def unknown(what: str, name: object, known: Collection[str], meant: Sequence[str
 def lookup(registry: Mapping[str, str], name: str, kind: str) -> Any:
     """Import and return the entry `name` of a registry of "backend", "method", or another kind.
 
-    Raises:
-        ValueError: `name` is not registered (the message lists the names that are), or is of another package that
-            fails, or ends the program, when it is imported.
+    A ValueError lists the registered names, or says that an entry of another package fails, or ends the program, when
+    it is imported.
 
     >>> lookup({"sqrt": "math:sqrt"}, "sqrt", "function")(9.0)
     3.0
@@ -97,17 +96,11 @@ class ConfigError(ValueError):
 def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
     """Return an instance of the dataclass `kind` with some of its fields set, nested dataclasses included.
 
-    `where` is the key of the values in the whole configuration, for messages.
+    `where` is the key of the values in the whole configuration. A ConfigError names an unknown or missing key, or a
+    value of another type.
 
-    Raises:
-        ConfigError: unknown keys (the known ones are listed), missing ones, or values of another type.
-
-    >>> from dataclasses import dataclass
-    >>> @dataclass
-    ... class Range:
-    ...     first: float
-    ...     last: float = 1.0
-    >>> typed(Range, {"first": 0})
+    >>> from dataclasses import make_dataclass
+    >>> typed(make_dataclass("Range", [("first", float), ("last", float, 1.0)]), {"first": 0})
     Range(first=0.0, last=1.0)
     """
     hints = _type_hints(kind)

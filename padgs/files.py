@@ -104,9 +104,7 @@ class ImageError(OSError):
 def open_image(file: Path | IO[bytes], name: object = None) -> Image:
     """Open an image of `IMAGE_FORMATS`, which `with` closes; pixels are decoded when they are needed.
 
-    Raises:
-        ImageError: it has another format, is damaged, or has more than `MAX_PIXELS` pixels.
-        OSError: it cannot be read.
+    An ImageError says that it has another format, is damaged, or has more than `MAX_PIXELS` pixels.
     """
     from PIL import Image, UnidentifiedImageError
 

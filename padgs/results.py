@@ -232,9 +232,8 @@ def _int(text: str) -> int:
 def decoded(document: Mapping[str, Any], where: str) -> Result:
     """Return the result of a document that `encoded` made; `where` names it in errors.
 
-    Raises:
-        ResultError: it is of another version, was edited, has values of other types, or has names that are unsafe in a
-            path or command (a digest is no signature, and files may come from elsewhere).
+    A ResultError says that it is of another version, was edited, has values of other types, or has names that are
+    unsafe in a path or command (a digest is no signature, and files may come from elsewhere).
     """
     document = dict(document)
     if document.pop("schema") != SCHEMA:

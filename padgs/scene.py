@@ -51,11 +51,7 @@ class View:
         return -rotation.transpose(0, 1) @ translation
 
     def image(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Return the image as floats in [0, 1], [H, W, 3], linear in the stored values.
-
-        Raises:
-            ValueError: the view has no pixels.
-        """
+        """Return the image as floats in [0, 1], [H, W, 3], linear in the stored values; a ValueError without pixels."""
         if self.load_pixels is None:
             raise ValueError(f"view {self.name!r} has a pose but no image; it can only be rendered")
         return self.load_pixels().to(device).to(dtype) / 255  # move first: bytes are a quarter of the floats

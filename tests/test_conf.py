@@ -89,7 +89,6 @@ def test_every_sweep_varies_its_key_alone_and_says_how_to_run_it(name):
         "offset_rate": {"method.offset_rate"},
         "omega_axis": {"method.omega_axis"},
         "offsets_and_features": {"method.offsets", "method.features"},
-        "precision": {"method.precision"},
         "projections": {"render.projection", "render.cubemap"},
         "resolution": {"data.width"},
         "seeds": {"seed"},

@@ -50,14 +50,9 @@ def views_along(
 ) -> list[View]:
     """Return the views of a camera path through the scene of a run; a ValueError if a file is no camera path.
 
-    Args:
-        run: with its scene.
-        path: a name of PATHS, or a JSON file of keyframes or of nerfstudio.
-        seconds: length of the video; None: 10, or the length stored in the file.
-        fps: frames per second.
-        width: pixels; 0: width of the training views, half of it in perspective.
-        perspective_shape: height in pixels (None: 9/16 of the width), and horizontal field of view in degrees; None
-            renders panoramas.
+    `path` is a name of PATHS, or a JSON file of keyframes or of nerfstudio; `seconds` None: 10, or the length stored in
+    the file; `width` 0: that of the training views, half of it in perspective. `perspective_shape` is the height in
+    pixels (None: 9/16 of the width) and the horizontal field of view in degrees; None renders panoramas.
     """
     scene, trained = run.scene, run.scene.train[0]
     if perspective_shape is None:
@@ -96,12 +91,10 @@ def write_video(
     spherical: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Path]:
-    """Render views and write them in order; return the written videos or folders.
+    """Render views and write them in order, one a frame; return the written videos or folders.
 
     Args:
         to: *.mp4, or a folder for PNGs. Files appear, and an existing video is replaced, when all frames are written.
-        views: one per frame, as `render` takes them.
-        fps: frames per second of an .mp4.
         scene_scale: unit of depths.
         depth: also write depth: as colours in an .mp4 (bright is near); beside PNGs as distances along the rays, with
             `depth.json`: unit, camera and pose of each frame in the world of the data set.

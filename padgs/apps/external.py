@@ -121,14 +121,10 @@ class ExternalRun(LoadedRun):
 
     @classmethod
     def open(cls, file: Path, config: RunConfig | None, rays: str, transform: str, device: str) -> ExternalRun:
-        """Open a file of Gaussians.
+        """Open a file of Gaussians with a suffix of `SPLATS`, rendered by a name of `RAYS`; device: auto, cpu or cuda.
 
-        Args:
-            file: with a suffix of `SPLATS`.
-            config: of `config_of`; None: no data set, so the scene is made of the Gaussians, without photographs.
-            rays: a name of `RAYS`.
-            transform: scene_from_file for `read_transform`, in the world of the data set; empty: the identity.
-            device: auto, cpu or cuda.
+        `config` is from `config_of`; None: no data set, so the scene is made of the Gaussians, without photographs.
+        `transform` is scene_from_file for `read_transform`, in the world of the data set; empty: the identity.
         """
         if rays not in RAYS:
             raise ValueError(unknown("--rays", rays, RAYS))
@@ -188,13 +184,10 @@ class ExternalRun(LoadedRun):
 def open_model(
     path: str, data: str | None = None, rays: str = "exact", transform: str = "", device: str = "auto"
 ) -> LoadedRun:
-    """Open the folder of a run, or a file of Gaussians.
+    """Open the folder of a run, or a file of Gaussians; device: auto, cpu or cuda.
 
-    Args:
-        path: of either.
-        data: of a run: where its data have moved; of a file: a data set, or a run on it.
-        rays, transform: of a file, see `ExternalRun.open`; a ValueError beside a run.
-        device: auto, cpu or cuda.
+    `data` is the place to which the data of a run have moved; of a file it is a data set, or a run on it. `rays` and
+    `transform` belong to a file, see `ExternalRun.open`; beside a run they are a ValueError.
     """
     if not is_splat_file(path):
         if transform or rays != "exact":
@@ -287,15 +280,10 @@ class Renders:
 def score_external(
     render: Render, config: RunConfig, scene: Scene, label: str, program: tuple[str, str], runs: Path
 ) -> tuple[Result, Path]:
-    """Score the test views, and write the result as that of a run; return it and its folder.
+    """Score the test views of a scene, and write the result as that of a run; return it and its folder.
 
-    Args:
-        render: renders a test view.
-        config: of `config_of`, with the options of the model.
-        scene: with test views.
-        label: name in tables.
-        program: name and version, empty if unknown.
-        runs: parent of the run folder.
+    `config` is from `config_of`, with the options of the model; `label` is the name in tables; `program` is name and
+    version, empty if unknown; `runs` is the parent of the run folder.
     """
     name = re.sub(r"[^A-Za-z0-9]+", "-", label).strip("-")[:40].lower()
     if not name:

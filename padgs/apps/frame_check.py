@@ -26,12 +26,10 @@ FINALISTS = 5  # of the aligned worlds, by distance of points; these are aligned
 
 
 def read_transform(text: str, transforms_json: Path | None = None) -> Similarity:
-    """Return the similarity scene_from_file that a user states.
+    """Return the similarity scene_from_file that a user states: identity, 12 or 16 numbers (matrix rows), or a file.
 
-    Args:
-        text: identity, 12 or 16 numbers (rows of a matrix), or a file of them (.json, .npy, text); nerfstudio's
-            `dataparser_transforms.json` is inverted, because it maps the world of the data set to that of the model.
-        transforms_json: of the data set, whose `applied_transform` nerfstudio's file includes.
+    Files hold numbers (.json, .npy, text). nerfstudio's `dataparser_transforms.json` is inverted, because it maps the
+    world of the data set to that of the model; it includes the `applied_transform` of the data set's `transforms_json`.
     """
     if text == IDENTITY:
         return shifted(torch.zeros(3))

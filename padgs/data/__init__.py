@@ -45,17 +45,13 @@ def load(
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     **fields: object,
 ) -> Scene:
-    """Load the scene of a data set.
+    """Load the scene of a data set; unusable input is a DataError, an unknown format a ValueError.
 
     Args:
         path: the data set's folder, or the file that describes it; None generates the built-in room.
         format: a name of `LOADERS`, or auto.
         options: the `data` group of the configuration.
         fields: single options by name; they override `options`.
-
-    Raises:
-        DataError: unusable input; the message names the file, the rule and the way out.
-        ValueError: unknown format.
     """
     options = replace(options, **fields)  # type: ignore[arg-type]
     if path is None and options.dataset is not None:

@@ -26,11 +26,7 @@ SKIPPED = ((PREPARED,), ("config.yaml", "renders"))
 
 
 def assemble(capture: Capture, options: DataOptions) -> Scene:
-    """Build the scene of a capture. Images are checked, but not decoded.
-
-    Raises:
-        DataError: images, poses, points, split or masks that training cannot use.
-    """
+    """Build the scene of a capture; a DataError if training cannot use it. Images are checked, but not decoded."""
     capture = replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
     names = [frame.name for frame in capture.frames]
     if not names:
@@ -119,10 +115,9 @@ def view_name(frame_name: str) -> str:
 
 
 def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_FOLDERS) -> Path:
-    """Return the image folder of a data set: the given one, else the first existing usual one, else its own folder.
+    """Return the given image folder of a data set, else the first existing usual one, else its own folder.
 
-    Raises:
-        DataError: the given folder does not exist.
+    A DataError says that the given folder does not exist.
     """
     if given is not None:
         if not (folder / given).is_dir():
@@ -153,11 +148,7 @@ def _is_skipped(folder: Path) -> bool:
 
 
 def refuse_clashes(names: Sequence[str]) -> None:
-    """Refuse images whose views would have the same name.
-
-    Raises:
-        DataError: two names differ only in case or extension.
-    """
+    """Refuse images whose views would have one name: names that differ only in case or extension."""
     seen: dict[str, str] = {}
     for name in names:
         key = view_name(name).casefold()
@@ -171,8 +162,7 @@ def refuse_clashes(names: Sequence[str]) -> None:
 def found_images(capture: Capture) -> Capture:
     """Find images whose stated names differ from their files in leading folders, Unicode form or extension.
 
-    Raises:
-        DataError: a name points outside the image folder, and no end of it is there.
+    A DataError says that a name points outside the image folder, and that no end of it is there.
     """
     there = {frame.name for frame in capture.frames if is_inside(frame.name) and os.path.isfile(frame.image)}
     if len(there) == len(capture.frames):

@@ -33,11 +33,7 @@ def listed(names: Iterable[object], most: int = 5) -> str:
 
 
 def refuse_special(path: Path) -> None:
-    """Refuse folders, pipes and devices in place of a file: reading a pipe waits, and some devices never end.
-
-    Raises:
-        DataError: the path exists, but is no file.
-    """
+    """Refuse folders, pipes and devices in place of a file: reading a pipe waits, and some devices never end."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path} cannot be read: it is no regular file; replace or remove it")
 

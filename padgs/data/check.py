@@ -77,12 +77,8 @@ def check(
 ) -> Report:
     """Check a data set. Problems are collected in `Report.problems`; they raise nothing.
 
-    Args:
-        path: folder or file, as for `padgs.data.load`.
-        format: a name of LOADERS, or auto.
-        options: the `data` group of the configuration.
-        overlay: file for the image of points on a panorama; None writes none.
-        progress: called with (images decoded, images in all).
+    `path`, `format` and `options` are as for `padgs.data.load`; `overlay` is the file for the image of points on a
+    panorama, None for none; `progress` is called with (images decoded, images in all).
     """
     report = Report(Path(path))
     try:
@@ -283,16 +279,9 @@ def _small(views: Sequence[View]) -> Tensor:
 
 
 def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:
-    """Save a panorama with points drawn on it, red = near, blue = far (by rank), as PNG.
+    """Save a panorama with points [P, 3] of the world drawn on it as PNG, red = near, blue = far (by rank).
 
-    Args:
-        view: the panorama.
-        points: [P, 3] world.
-        path: of the PNG.
-        most: maximum number of points; larger clouds are thinned out evenly.
-
-    Raises:
-        DataError: the file cannot be written.
+    Clouds of more than `most` points are thinned out evenly. A DataError says that the file cannot be written.
     """
     assert view.load_pixels is not None
     image = Image.fromarray(view.load_pixels().cpu().numpy())

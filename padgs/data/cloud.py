@@ -20,11 +20,7 @@ SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read a point cloud from a PLY file: x, y, z, and colours if there are any (`color_bytes`, or `SH_CHANNELS`).
-
-    Raises:
-        DataError: missing file, no PLY file, truncated, or without x, y, z.
-    """
+    """Read a point cloud from a PLY file: x, y, z, and colours if there are any (`color_bytes`, or `SH_CHANNELS`)."""
     vertex, names = read_vertices(path)
     stored = {name.lower(): name for name in sorted(names)}
 
@@ -47,11 +43,7 @@ def read_ply(path: Path) -> Cloud:
 
 
 def read_cloud(path: Path) -> tuple[Cloud, tuple[str, ...]]:
-    """Read a point cloud by its extension: LAS, LAZ, E57, else PLY; and notes.
-
-    Raises:
-        DataError: missing or damaged, or the package that reads it is not installed.
-    """
+    """Read a point cloud by its extension: LAS, LAZ, E57, else PLY; and notes."""
     if path.suffix.lower() in (".las", ".laz", ".e57"):
         from padgs.data import scans
 
@@ -63,10 +55,7 @@ def color_bytes(values: NDArray[Any], where: str) -> Tensor:
     """Scale colours [P, 3] to uint8 by the range of their type: 1 for floats, 255 or 65535 for whole numbers.
 
     Fields of 16 bits often hold colours of 8 bits, and floats those of integers. The range is therefore the smallest
-    that holds the median value (without black). A few values outside the range are clamped.
-
-    Raises:
-        DataError: a colour is not finite; `where` names the file.
+    that holds the median value (without black). A few values outside the range are clamped; `where` names the file.
     """
     if not (finite := np.isfinite(values).all(1)).all():
         raise DataError(f"the colour of point {(~finite).nonzero()[0][0]} of {where} is not finite; repair the cloud")
@@ -89,8 +78,7 @@ def whole_if_possible(values: NDArray[np.float64]) -> NDArray[Any]:
 def read_vertices(path: Path) -> tuple[Any, set[str]]:
     """Return the vertices of a PLY file, one column per property, and the names of properties that are numbers.
 
-    Raises:
-        DataError: missing file, no PLY file, truncated, or without vertices.
+    A DataError says that the file is missing, no PLY file, truncated, or without vertices.
     """
     from plyfile import PlyData, PlyListProperty, PlyParseError
 
@@ -132,14 +120,9 @@ GREY = 128
 
 
 def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:
-    """Return the initial points [P, 3] float64, their colours [P, 3] uint8, and notes.
+    """Return the initial points [P, 3] float64, their colours [P, 3] uint8, and notes; a DataError for unusable points.
 
-    Args:
-        capture: a data set.
-        source: `data.points`: auto (the format's own, else random), random, or a file for `read_cloud`.
-
-    Raises:
-        DataError: there is no point, or one is not finite.
+    `source` is `data.points`: auto (the format's own, else random), random, or a file for `read_cloud`.
     """
     notes: tuple[str, ...] = ()
     cloud, where = capture.cloud, f"the {capture.format} model in {capture.folder}"

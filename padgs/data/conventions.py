@@ -37,13 +37,10 @@ class Convention(NamedTuple):
 
 
 def colour_fit(poses: Tensor, images: Tensor, points: Tensor, colors: Tensor) -> float:
-    """Return the correlation of point and pixel colours; 1 = equal, about 0 = unrelated.
+    """Return the correlation of the colours of points [P, 3] and their pixels; 1 = equal, about 0 = unrelated.
 
-    Args:
-        poses: [F, 4, 4] cam_from_world.
-        images: [F, H, W, 3] uint8, panoramas reduced to a few hundred pixels width.
-        points: [P, 3] world.
-        colors: [P, 3] uint8.
+    `poses` are cam_from_world [F, 4, 4], `images` [F, H, W, 3] uint8 panoramas of a few hundred pixels width, `colors`
+    [P, 3] uint8.
     """
     found = _pixels(poses, images, points)
     colors = colors[:: max(1, len(points) // POINTS)].float().expand_as(found)

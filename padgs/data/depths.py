@@ -73,10 +73,8 @@ def with_depths(
 ) -> tuple[list[View], list[str], list[str]]:
     """Return the views of the capture's frames with `load_depth`, digests of the files, and notes.
 
-    Maps are held in memory if all fit into `cache_bytes`; else they are read on each access.
-
-    Raises:
-        DataError: files of unknown meaning, damaged, of another shape than a view, or without a known distance.
+    Maps are held in memory if all fit into `cache_bytes`; else they are read on each access. A DataError says that a
+    file is of unknown meaning, damaged, of another shape than its view, or without a known distance.
     """
     files, meaning = ({}, None) if options.depth == "none" else _depth_files(capture)
     if meaning is None:
@@ -112,11 +110,7 @@ def with_depths(
 
 
 def read_depth(file: Path) -> NDArray[np.float32]:
-    """Read the numbers of a depth map, [H, W].
-
-    Raises:
-        DataError: unreadable, damaged, 8-bit, of several channels that differ, or EXR without OpenEXR.
-    """
+    """Read the numbers of a depth map, [H, W]; a DataError for a damaged or 8-bit file, or for channels that differ."""
     data = read_bytes(file)
     try:
         if file.suffix.lower() == ".npy":

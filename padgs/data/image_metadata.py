@@ -62,11 +62,7 @@ def load_late_chunks(image: Image.Image, data: bytes) -> None:
 
 
 def refuse_rotated(image: Image.Image, path: object) -> None:
-    """Refuse pixels that are stored rotated, by EXIF or XMP.
-
-    Raises:
-        DataError: the orientation is not upright.
-    """
+    """Refuse pixels that are stored rotated, by EXIF or XMP."""
     has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
     orientations = {
         "EXIF": image.getexif().get(_ORIENTATION) if has_exif else 1,
@@ -81,11 +77,7 @@ def refuse_rotated(image: Image.Image, path: object) -> None:
 
 
 def refuse_several_pictures(image: Image.Image, path: object) -> None:
-    """Refuse animations, several pages and stereo pairs. Previews and gain maps beside a picture are no pictures.
-
-    Raises:
-        DataError: it is unknown which picture is meant.
-    """
+    """Refuse animations, several pages and stereo pairs. Previews and gain maps beside a picture are no pictures."""
     count = getattr(image, "n_frames", 1)
     if image.format == "MPO":
         kinds = {str(entry["Attribute"]["MPType"]) for entry in image.mpinfo.get(0xB002, ())}  # type: ignore[attr-defined]
@@ -103,8 +95,7 @@ def refuse_several_pictures(image: Image.Image, path: object) -> None:
 def crop_of(image: Image.Image, path: object) -> Crop | None:
     """Return where the picture lies in its panorama by GPano metadata; None if it is the whole panorama.
 
-    Raises:
-        DataError: another projection, or numbers that contradict each other.
+    A DataError names another projection, or numbers that contradict each other.
     """
     xmp = _xmp(image)
     projection = stated(xmp, "ProjectionType")
@@ -141,8 +132,7 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
 def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:
     """Return the conversion to sRGB of RGB pixels by profile, gamma and colour space; None if they are sRGB.
 
-    Raises:
-        DataError: the colours are described in a way that is not supported.
+    Colours that are described in an unsupported way are a DataError.
     """
     header = data[: data.find(b"IDAT")] if image.format == "PNG" else b""
     if (place := header.find(b"cICP")) >= 0 and header[place + 4 : place + 8] != bytes((1, 13, 0, 1)):

@@ -50,9 +50,8 @@ class ImageFile:
 def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
-    Raises:
-        DataError: missing, unreadable, not an image, truncated, rotated, of several pictures, 16-bit, grey, not 2:1,
-            partly transparent, or with colours that cannot be converted to sRGB.
+    A DataError says why not: unreadable, truncated, rotated, of several pictures, 16-bit, grey, not 2:1, partly
+    transparent, or with colours that cannot be converted to sRGB.
     """
     data = read_bytes(path)
     with _opened(data, path) as image:
@@ -111,11 +110,7 @@ def notes_on(images: Sequence[ImageFile]) -> list[str]:
 
 
 def refuse_other_shapes(width: int, height: int, path: Path) -> None:
-    """Refuse image sizes that are not 2:1.
-
-    Raises:
-        DataError: the size is not that of a full panorama.
-    """
+    """Refuse image sizes that are not 2:1."""
     if width != 2 * height or not height:
         eyes = {1: "one above the other", 4: "side by side"}.get(
             width // height if height and width % height == 0 else 0
@@ -130,8 +125,7 @@ def refuse_other_shapes(width: int, height: int, path: Path) -> None:
 def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
     """Decode an image file to uint8 pixels, [H, W, 3] for RGB in sRGB, and [H, W, 1] for L.
 
-    Raises:
-        DataError: the file is truncated, damaged, or partly transparent.
+    A DataError says that the file is truncated, damaged, or partly transparent.
     """
     return _decode(read_bytes(path), path, mode)
 
@@ -189,11 +183,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def read_bytes(path: Path, *, empty: bool = False) -> bytes:
-    """Read a file, which may be `empty` if that is allowed.
-
-    Raises:
-        DataError: missing, unreadable, empty, or a folder, pipe or device, which could be read without end.
-    """
+    """Read a file, which may be `empty` if that is allowed; a DataError for no file, or a folder, pipe or device."""
     refuse_special(path)
     try:
         data = path.read_bytes()
@@ -243,11 +233,7 @@ MIN_BLACK_OUTSIDE, MAX_BLACK_RIM = 0.98, 0.5  # shares of the pixels
 
 
 def refuse_dual_fisheye(pixels: NDArray[np.uint8], path: Path) -> None:
-    """Refuse pixels [H, 2H, 3] of an unstitched dual-fisheye camera.
-
-    Raises:
-        DataError: the image shows two circles on black instead of a panorama.
-    """
+    """Refuse pixels [H, 2H, 3] of an unstitched dual-fisheye camera: two circles on black."""
     if is_dual_fisheye(pixels):
         raise DataError(
             f"{path} shows two circles side by side: it is the dual-fisheye image of a 360-degree camera, not a "

@@ -76,16 +76,10 @@ def find_masks(
 ) -> tuple[list[Mask | None], list[str], list[str]]:
     """Return the mask of each frame, the digests of the mask files, and notes.
 
-    Args:
-        capture: frames, and the folder that is searched for masks.
-        spec: `data.mask`; see `mask_path`.
-        images: the files of the frames.
-        sizes: (width, height) of the views.
-        store: caches decoded masks.
-
-    Raises:
-        DataError: a mask differs in size from its image, shows less than `MIN_VISIBLE`, or has transparent pixels;
-            masks that `spec` does not name hide more than `MAX_HIDDEN`, as inverted ones do; or `spec` is invalid.
+    `spec` is `data.mask`, see `mask_path`; `images` are the files of the frames, `sizes` (width, height) of the views;
+    `store` caches decoded masks. A DataError says that a mask differs in size from its image, shows less than
+    `MIN_VISIBLE`, or has transparent pixels; that masks which `spec` does not name hide more than `MAX_HIDDEN`, as
+    inverted ones do; or that `spec` is invalid.
     """
     spec = capture.mask if spec == "auto" else spec
     inverted, given = spec == "inverted" or spec.startswith("inverted:"), spec
@@ -147,10 +141,7 @@ def find_masks(
 def mask_path(spec: str, folder: Path) -> Path | None:
     """Return the file or folder that `data.mask` names; None for a keyword.
 
-    Relative paths are looked up in the data set's folder and in the working directory.
-
-    Raises:
-        DataError: both exist and differ.
+    Relative paths are looked up in the data set's folder and in the working directory; two that differ are a DataError.
     """
     if spec in ("auto", "none", "inverted") or _ROWS.fullmatch(spec):
         return None
@@ -234,9 +225,7 @@ def _in_folder(folder: Path, name: str, beside: bool, listings: dict[Path, dict[
 def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:
     """Write mask.png if all views share a mask, else masks/ with one file per masked view.
 
-    Args:
-        masks: view name -> function that loads its weights [H, W]. At most two masks are in memory at a time.
-        folder: of the data set.
+    `masks` holds the function that loads the weights [H, W] of each view. At most two masks are in memory at a time.
     """
     loaders = {name: load for name, load in masks.items() if load is not None}
     if loaders and len(loaders) == len(masks):

@@ -58,10 +58,8 @@ def moved(frames: Sequence[Frame], cloud: Cloud | None, new_from_old: Similarity
 def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) -> tuple[Similarity, str] | None:
     """Return the similarity that leads to a world in metres, and a note on the scale; None if no length is known.
 
-    With GPS, x is east, y north and z up, from the mean of the cameras' positions.
-
-    Raises:
-        DataError: the scale does not follow from what is known; the message says by which numbers.
+    With GPS, x is east, y north and z up, from the mean of the cameras' positions. A DataError says by which numbers
+    the scale does not follow from what is known.
     """
     poses = torch.stack([frame.cam_from_world for frame in frames])
     if known.metres is not None:

@@ -73,15 +73,9 @@ class _Mask(_Resampled):
 
 
 def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple[View, ...]:
-    """Resample perspective views with the centre of a panorama.
+    """Resample perspective views of a lens with the centre of a panorama; another camera is a ValueError.
 
-    Args:
-        panorama: a view of the whole sphere.
-        rotations: [K, 3, 3] from the panorama's camera frame to the views'; rows are right, down, forward.
-        lens: of all views.
-
-    Raises:
-        ValueError: the view is not a panorama.
+    `rotations` [K, 3, 3] lead from the panorama's camera frame to the views'; rows are right, down, forward.
     """
     if not isinstance(panorama.camera, Panorama):
         raise ValueError(

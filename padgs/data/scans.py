@@ -20,11 +20,7 @@ CHANNELS = ("red", "green", "blue")
 
 
 def optional_module(name: str, path: Path) -> Any:
-    """Import the package that reads a file.
-
-    Raises:
-        DataError: it is not installed; the message says how to install it.
-    """
+    """Import the package that reads a file; a DataError says how to install it."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -71,11 +67,7 @@ def _readable(path: Path, again: str) -> Iterator[None]:
 
 
 def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
-    """Read a LAS or LAZ file, and notes. Colours may have 8 or 16 bits.
-
-    Raises:
-        DataError: laspy or a decoder of LAZ is missing, or the file is damaged.
-    """
+    """Read a LAS or LAZ file, and notes. Colours may have 8 or 16 bits."""
     laspy = optional_module("laspy", path)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         optional_module("lazrs", path)
@@ -106,11 +98,7 @@ def _las_points(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None,
 
 
 def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:
-    """Read the points of all scans of an E57 file in the file's common frame, and notes.
-
-    Raises:
-        DataError: pye57 is missing, or the file is damaged.
-    """
+    """Read the points of all scans of an E57 file in the file's common frame, and notes."""
     with open_e57(path) as file:
         headers = [file.get_header(index) for index in range(file.scan_count)]
         step = -(-sum(header.point_count for header in headers) // MOST_POINTS) or 1

@@ -32,6 +32,8 @@ def split_frames(
 ) -> Split:
     """Decide for each frame whether it is a training view, a test view, or unused.
 
+    A DataError says that a list holds unknown or ambiguous names, that lists overlap, or that a side is empty.
+
     Args:
         names: frame names with extension, sorted.
         folder: holds `train.txt` and `test.txt`, if any: one name a line, with or without extension.
@@ -40,9 +42,6 @@ def split_frames(
         every: k.
         stated: the format's own lists.
         unposed: names of images without a pose, for clear error messages.
-
-    Raises:
-        DataError: a list holds unknown or ambiguous names, lists overlap, or a side is empty.
     """
     if mode == "all":
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
@@ -78,20 +77,12 @@ def split_frames(
 
 
 def read_list(path: Path) -> tuple[str, ...]:
-    """Read the names in a list file: one a line, blank lines skipped, any line ending, optional byte-order mark.
-
-    Raises:
-        DataError: no text file.
-    """
+    """Read the names in a list file: one a line, blank lines skipped, any line ending, optional byte-order mark."""
     return tuple(check_name(line.strip(), str(path)) for line in read_lines(path) if line.strip())
 
 
 def read_lines(path: Path, errors: str = "strict") -> list[str]:
-    """Read the lines of a text file; `errors` is that of `bytes.decode`.
-
-    Raises:
-        DataError: not UTF-8, or unreadable; see `read_bytes`.
-    """
+    """Read the lines of a text file in UTF-8; `errors` is that of `bytes.decode`."""
     try:
         return read_bytes(path, empty=True).decode("utf-8-sig", errors).splitlines()
     except UnicodeDecodeError as error:
@@ -106,11 +97,7 @@ def is_inside(name: str) -> bool:
 
 
 def check_name(name: str, where: str) -> str:
-    """Return a name that a file system can hold.
-
-    Raises:
-        DataError: the name is not Unicode, or too long; `where` names its source.
-    """
+    """Return a name that a file system can hold; a DataError if it is not Unicode or too long, `where` says whose."""
     if any(0xD800 <= ord(character) < 0xE000 for character in name):
         raise DataError(f"{where} names {name!r}, which is not Unicode; rename the file, and export again")
     if any(len(part.encode()) > MAX_NAME_BYTES for part in PurePosixPath(name.replace("\\", "/")).parts):

@@ -31,9 +31,6 @@ def area_resize(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np
     Every output pixel is the mean of the input area it covers, fractions of pixels included; Pillow's BOX is exact for
     integer ratios only. Works in bands of rows: a 6080 x 3040 panorama takes a few MB besides input and output.
 
-    Raises:
-        ValueError: the output is larger than the input.
-
     >>> area_resize(np.array([[[0], [90], [30]]], np.uint8), 2, 1)[..., 0]
     array([[30, 50]], dtype=uint8)
     """

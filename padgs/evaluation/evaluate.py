@@ -29,12 +29,8 @@ def evaluate(
 ) -> Scores:
     """Render each test view and compare it with its ground truth; a Failure (nan) if a render is not finite.
 
-    Args:
-        render: `render` of a trained method.
-        views: each has an image, and may have a mask.
-        protocol: metrics, weights and crop.
-        on_view: called with each view, its truth and its render (clamped, 8-bit, not cropped), to save images.
-        extra: computes further metrics of each view.
+    `on_view` is called with each view, its truth and its render (clamped, 8-bit, not cropped), to save images; `extra`
+    computes further metrics of each view.
     """
     if not views:
         raise ValueError("no test views to evaluate; give the scene a test split")

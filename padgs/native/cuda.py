@@ -112,26 +112,14 @@ class DeviceDecodeGradientArguments(ctypes.Structure):
     ]
 
 
-class NetworkInputs(ctypes.Structure):
-    _fields_ = [*fields(Pointer, "features", "seen"), *fields(Int32, "feature_count", "type")]
-
-
-class NetworkArguments(ctypes.Structure):
-    _fields_ = [("device", DeviceDecodeArguments), ("inputs", NetworkInputs)]
-
-
-class NetworkGradientArguments(ctypes.Structure):
-    _fields_ = [("gradient", abi.DecodeGradientArguments), ("inputs", NetworkInputs), ("room", Int64)]
-
-
 STRUCTURES = (
     *(Queue, ProjectArguments, ProjectGradientArguments, SortArguments, BinArguments, BlendInputs),
     *(BlendGradientInputs, RemovalInputs, DeviceLossArguments, DeviceSplatArguments, DeviceDecodeArguments),
-    *(DeviceDecodeGradientArguments, NetworkInputs, NetworkArguments, NetworkGradientArguments),
+    DeviceDecodeGradientArguments,
 )
 CALLS = (  # that take a queue and a structure
     *("project", "sort", "blend", "blend_backward", "leave_one_out", "project_backward", "splats", "decode_place"),
-    *("decode_take_back", "networks_opacity", "networks_attributes", "networks_backward", "photometric_loss"),
+    *("decode_take_back", "photometric_loss"),
 )
 SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
@@ -143,8 +131,6 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_scratch_bytes": ([Pointer, Int64], Int64),
     "padgs_cuda_pose_blocks": ([Int64], Int64),
     "padgs_cuda_bin": ([Pointer, Pointer, Int32], Int32),
-    "padgs_cuda_networks_fit": ([Pointer, Int32, Int32, Int32, Int32], Int32),
-    "padgs_cuda_networks_blocks": ([Int64], Int64),
     "padgs_cuda_loss_blocks": ([Int32, Int32], Int64),
     **{f"padgs_cuda_{name}": ([Pointer, Pointer], Int32) for name in CALLS},
 }

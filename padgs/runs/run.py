@@ -64,13 +64,9 @@ def run(
 ) -> Result:
     """Do what is missing of a run, and show its result.
 
-    Args:
-        config, scene: the run, and its scene as `load_scene(config, start(config))` returns it; loaded if None.
-        console: receives progress and the result.
-        callback: is told of the folder and of checkpoints.
-        brief: show only progress.
-
-    Errors of the input and of files are `REPORTED`. Starting the run again after `Interrupted` resumes it.
+    `scene` is as `load_scene(config, start(config))` returns it; loaded if None. `console` receives progress and the
+    result, if `brief` only progress; `callback` is told of the folder and of checkpoints. Errors of the input and of
+    files are `REPORTED`. Starting the run again after `Interrupted` resumes it.
     """
     scene = load_scene(config, start(config)) if scene is None else scene
     store = RunStore.of(config, scene)

@@ -56,10 +56,9 @@ class Trainer:
     ) -> None:
         """Prepare; nothing is rendered yet.
 
-        Args:
-            views_each: views per iteration; Adam steps on the sum of their losses.
-            coarse_share: share of the run in which views are smaller, see `padgs.training.targets.Targets`.
-            stage: entered with the name of each part of an iteration, for timing.
+        `views_each` are the views per iteration: Adam steps on the sum of their losses. Views are smaller in
+        `coarse_share` of the run, see `padgs.training.targets.Targets`. `stage` is entered with the name of each part
+        of an iteration, for timing.
         """
         self.iteration = self.step = self.skipped = 0
         self.ended = ""

@@ -48,12 +48,9 @@ class Budget:
     def next_step(self, last: int, spent: float, step_seconds: float, *, skipped: int = 0, began: float = 0.0) -> int:
         """Return the schedule step of the next iteration; `iterations` for the last one.
 
-        Args:
-            last: step of the iteration before, 0 for none.
-            spent: seconds of training so far, with building the initial model.
-            step_seconds: expected duration of the next iteration.
-            skipped: steps that took no time because they were skipped.
-            began: seconds spent before the first step; the schedule fills the rest.
+        `last` is the step of the iteration before, 0 for none; `spent` the seconds of training so far, with building
+        the initial model; `step_seconds` the expected duration of the next iteration; `skipped` the number of steps
+        that took no time; `began` the seconds before the first step, after which the schedule fills the rest.
 
         >>> timed = Budget(100, seconds=10.0)
         >>> Budget(100).next_step(6, spent=50.0, step_seconds=1.0), timed.next_step(6, spent=4.0, step_seconds=1.0)

@@ -24,12 +24,10 @@ def problem(
     return {name: tensor.to(device) for name, tensor in tensors.items()}, decoder
 
 
-def decoded(
-    function, tensors: dict[str, Tensor], decoder: Decoder, precision: str = "float32"
-) -> tuple[Gaussians, Tensor, Tensor, dict]:
+def decoded(function, tensors: dict[str, Tensor], decoder: Decoder) -> tuple[Gaussians, Tensor, Tensor, dict]:
     """Return Gaussians, slots, raw opacities, and the gradients of randomly weighted outputs."""
     leaves = {name: tensor.clone().requires_grad_(name in LEARNED) for name, tensor in tensors.items()}
-    gaussians, slots, raw, *_ = function(decoder.weights(), SeenAnchors(**leaves), precision)
+    gaussians, slots, raw, *_ = function(decoder.weights(), SeenAnchors(**leaves))
     generator = torch.Generator().manual_seed(0)
     values = list(vars(gaussians).values())
     upstream = [torch.randn(value.shape, generator=generator).to(value) for value in values]

@@ -91,12 +91,9 @@ class FilmControls:
     ) -> None:
         """Add the controls to a `viser.ClientHandle`.
 
-        Args:
-            client, folder: the page, and the folder of the run or beside a file.
-            model: run or file, as `padgs render` opens it.
-            origin: of the scene in the world of its data set, in which paths are stored.
-            pose: returns the current cam_from_world.
-            may_write: save beside the run; else the browser downloads the file.
+        `folder` is that of the run or beside a file, `model` the run or file as `padgs render` opens it. Paths are
+        stored in the world of the data set, where the scene has its `origin`; `pose` returns the current
+        cam_from_world. `may_write`: save beside the run; else the browser downloads the file.
         """
         self._client, self._folder, self._model, self._origin, self._pose = client, folder, model, origin, pose
         self._may_write, self.keyframes = may_write, list[Tensor]()

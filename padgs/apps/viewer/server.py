@@ -67,11 +67,9 @@ def serve(
 
 @contextmanager
 def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
-    """Serve empty pages to any number of browsers, until the context ends.
+    """Serve empty pages to any number of browsers, until the context ends; `LOCAL` serves this machine only.
 
-    Args:
-        host: `LOCAL` serves this machine only.
-        port: the first port to try; the next free one is used.
+    `port` is the first port to try; the next free one is used.
     """
     viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
     port = free_port(host, port)

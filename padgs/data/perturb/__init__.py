@@ -39,11 +39,7 @@ class StressOptions:
         return "" if self.condition == NONE or self.level == 0 else f"{self.condition} {self.level}"
 
     def apply(self, scene: Scene, seed: int) -> Scene:
-        """Return the perturbed scene, with a note that says so.
-
-        Raises:
-            ValueError: the condition cannot be applied to this scene.
-        """
+        """Return the perturbed scene, with a note; a ValueError if the condition cannot be applied to it."""
         if not self.title:
             return scene
         condition = CONDITIONS[self.condition]

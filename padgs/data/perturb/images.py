@@ -181,11 +181,7 @@ def noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
 
 @condition("training views have 1/{} of the width and height", 2, 4, 8, allowed=(2.0,))
 def resolution(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
-    """Reduce the width and height of training views by a factor; test views keep theirs.
-
-    Raises:
-        ValueError: the size of a view is not divisible by the factor.
-    """
+    """Reduce the width and height of training views by a factor that divides them; test views keep theirs."""
 
     def shrink(view: View) -> View:
         if view.width % (2 * factor) or view.height % factor:
@@ -219,11 +215,7 @@ def change_pixels(
 
 
 def _panorama(view: View) -> View:
-    """Return the view.
-
-    Raises:
-        ValueError: it is not a panorama.
-    """
+    """Return the view; a ValueError if it is not a panorama."""
     if view.lens is not None:
         raise ValueError(f"view {view.name!r} is not a panorama, but this condition is made for panoramas")
     return view

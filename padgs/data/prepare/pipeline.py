@@ -60,16 +60,15 @@ def prepare(
 ) -> Prepared:
     """Compute poses and points of panoramas by structure from motion.
 
+    A DataError names unusable input, panoramas without a relative pose, or a full disk. Intermediate results stay in
+    the hidden folder; nothing is written to the destination.
+
     Args:
         source: a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video.
         destination: a folder that does not exist, is empty, or was written by the same call. Gets images/, sparse/0
             (COLMAP, camera EQUIRECTANGULAR), masks if there are any, and prepare.json.
         options: defaults if None. Results are reproducible on one machine.
         progress: called with (step, done, total).
-
-    Raises:
-        DataError: unusable input, no two images with a relative pose, or a full disk. Intermediate results stay in the
-            hidden folder; nothing is written to the destination.
     """
     options = options or PrepareOptions()
     if result := _existing(source, destination, options):
@@ -109,11 +108,7 @@ def prepare(
 
 
 def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
-    """Return the result of an earlier call; None if the destination is free.
-
-    Raises:
-        DataError: something else is there.
-    """
+    """Return the result of an earlier call; None if the destination is free, a DataError if something else is there."""
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
         return None
     if result := find_result(source, destination, options):

@@ -146,16 +146,10 @@ def reconstruct(
     progress: Progress,
     mapper: str = "incremental",
 ) -> int:
-    """Compute poses and points, and write a model for each part that cannot be connected to others.
+    """Compute poses and points; write a model for each part that cannot be connected to others, return their number.
 
     `images_per_pose` is the number of views in a rig, else 1. `mapper` is one of `MAPPERS`: incremental adds one
-    panorama after the other, global places all at once.
-
-    Returns:
-        Number of parts; 0 if no two images could be placed.
-
-    Raises:
-        DataError: the installed pycolmap has no global mapper.
+    panorama after the other, global places all at once; a DataError if the installed pycolmap cannot.
     """
     pycolmap = pycolmap_module()
     pycolmap.set_random_seed(seed)

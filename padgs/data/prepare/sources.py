@@ -44,16 +44,10 @@ def is_video(path: Path) -> bool:
 def extract_frames(
     video: Path, folder: Path, per_second: float, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> int:
-    """Write the sharpest frame of every 1 / per_second seconds of a stitched video as frame_00001.jpg, ...
+    """Write the sharpest frame of every 1 / per_second seconds of a stitched video as frame_00001.jpg, ...; count them.
 
-    `progress` is called with (frames decoded, estimated total).
-
-    Returns:
-        Number of frames written.
-
-    Raises:
-        DataError: the extra `video` is not installed, the file cannot be decoded, or its frames are not panoramas.
-        OSError: a frame cannot be written.
+    `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
+    installed, that the file cannot be decoded, or that its frames are no panoramas.
     """
     written = 0
     for frame in _sharpest(video, per_second, progress):
@@ -103,11 +97,7 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
 
 
 def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
-    """Return the pixels of a frame.
-
-    Raises:
-        DataError: the video says that they are not one upright panorama, or are in colours of HDR.
-    """
+    """Return the pixels of a frame; a DataError if they are not one upright panorama, or in colours of HDR."""
     if getattr(frame, "color_trc", None) in _HDR_TRANSFER:
         raise DataError(
             f"{video} is HDR (transfer {_HDR_TRANSFER[frame.color_trc]}); export it in standard dynamic range"
@@ -156,11 +146,9 @@ class Source:
 def find_source(path: Path, mask: str) -> Source:
     """Read and check a folder of panoramas, or one that holds them in images/.
 
-    `mask` is as `data.mask`: auto searches for mask.png and masks/ beside the images and beside an images/ folder.
-
-    Raises:
-        DataError: no folder, an unstitched file, fewer than two panoramas, an unusable image, names that differ only in
-            case or extension, or an unusable mask.
+    `mask` is as `data.mask`: auto searches for mask.png and masks/ beside the images and beside an images/ folder. A
+    DataError names an unstitched file, fewer than two panoramas, an unusable image or mask, or names that differ only
+    in case or extension.
     """
     if path.is_file() and path.suffix.lower() in UNSTITCHED:
         raise DataError(f"{path} {_NOT_STITCHED}")

@@ -47,11 +47,7 @@ def free_memory() -> int | None:
 
 
 def refuse_full(folder: Path) -> None:
-    """Refuse to work on a nearly full disk, on which pycolmap's threads would kill the process without a message.
-
-    Raises:
-        OSError: less than `MIN_FREE_DISK` is left.
-    """
+    """Refuse by an OSError to work on a nearly full disk, where pycolmap's threads would kill the process silently."""
     if shutil.disk_usage(folder).free < MIN_FREE_DISK:
         raise OSError(
             errno.ENOSPC, f"less than {MIN_FREE_DISK >> 20} MiB is left on its disk: free some space", str(folder)
@@ -182,11 +178,7 @@ class WorkFolder:
         self.seconds[name] = round(time.perf_counter() - start, 2)
 
     def run_once(self, step: str, action: Callable[[], None]) -> None:
-        """Run a step unless its marker exists.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Run a step unless its marker exists; an OSError if the disk is full."""
         marker = self.path / f"{step}.done"
         with self.step(step):
             if not marker.exists():

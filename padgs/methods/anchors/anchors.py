@@ -17,7 +17,6 @@ from padgs.checks import check, check_known
 from padgs.gaussians import Gaussians
 from padgs.geometry.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
 from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
-from padgs.methods.anchors.native_decoder import PRECISIONS
 from padgs.native.cuda import HostCopy
 from padgs.scene import Scene, View
 from padgs.training.initial_points import refuse_unusable, squared_spacing
@@ -35,7 +34,6 @@ class PaDGSOptions:
     features: int = 32  # C, learned features per anchor
     offsets: int = 10  # K, Gaussians per anchor
     hidden: int = 32  # width of the hidden layer of each network
-    precision: str = "float32"  # of the networks' products: float32; bfloat16 or float16 for GPUs
     tau: float = 0.9  # Eq. 15; 0 turns opacity modulation off
     use_distance: bool = True  # distance camera - anchor as network input
     use_distortion: bool = True  # distortion degree as network input (DAGD)
@@ -47,8 +45,7 @@ class PaDGSOptions:
     voxel_pixels: float = 0.1  # voxel_size=auto: pixels at the median depth; below 1 like the paper's voxels
 
     def __post_init__(self) -> None:
-        check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS)
-        check_known(self, distance_unit=DISTANCE_UNITS, precision=PRECISIONS)
+        check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS, distance_unit=DISTANCE_UNITS)
         check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
         check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
         check(self, "> 0 and finite", lambda pixels: 0 < pixels < math.inf, "voxel_pixels")
@@ -163,9 +160,8 @@ class PaDGS(nn.Module):
 
     def decode(self, view: View, capacity: int | None = None) -> Decoded:
         """Decode the Gaussians that a view sees (Eq. 13-15); `capacity` as in `decode_gaussians`."""
-        gaussians, slots, raw_opacities, count = decode_gaussians(
-            self.decoder.weights(), self.seen_anchors(view), self.options.precision, capacity
-        )
+        weights, seen = self.decoder.weights(), self.seen_anchors(view)
+        gaussians, slots, raw_opacities, count = decode_gaussians(weights, seen, capacity)
         if self.unit != 1:
             gaussians = replace(gaussians, means=self.unit * gaussians.means, scales=self.unit * gaussians.scales)
         return Decoded(gaussians, slots, raw_opacities, None if count is None else HostCopy(count))

@@ -1,7 +1,7 @@
 """The decoder: three small networks that turn an anchor as seen from a camera into K Gaussians (paper Eq. 13-14).
 
-`decode_gaussians` is a pure function of tensors. It calls a native library if there is one (float32 on the CPU, any
-precision on a GPU); `define_gaussians` is the definition. Only products of the networks have a reduced precision.
+`decode_gaussians` is a pure function of tensors. It calls a native library if there is one, for float32;
+`define_gaussians` is the definition.
 """
 
 import math
@@ -18,8 +18,6 @@ from padgs.methods.anchors.native_decoder import (
     OPACITY_VALUES,
     decode_on_cpu,
     decode_on_gpu,
-    linear,
-    reduced_dtype,
 )
 from padgs.native import LIBRARIES, cpu
 
@@ -32,10 +30,10 @@ class Head(NamedTuple):
     w2: Tensor  # [O, H]
     b2: Tensor  # [O]
 
-    def __call__(self, inputs: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Return outputs [A, O] for inputs [A, I]; products in `dtype`, see `padgs.methods.anchors.native_decoder`."""
-        hidden = torch.relu(linear(inputs, self.w1, self.b1, dtype))
-        return linear(hidden, self.w2, self.b2, dtype)
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Return outputs [A, O] for inputs [A, I]."""
+        hidden = torch.relu(torch.addmm(self.b1, inputs, self.w1.T))
+        return torch.addmm(self.b2, hidden, self.w2.T)
 
 
 class DecoderWeights(NamedTuple):
@@ -58,53 +56,45 @@ class SeenAnchors(NamedTuple):
 
 
 def decode_gaussians(
-    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32", capacity: int | None = None
+    weights: DecoderWeights, anchors: SeenAnchors, capacity: int | None = None
 ) -> tuple[Gaussians, Tensor, Tensor, Tensor | None]:
     """Return the selected Gaussians of all anchors (Eq. 13-15).
 
-    Differentiable by weights, features, offsets and log-scales.
-
-    Args:
-        weights, anchors: the networks and their inputs.
-        precision: a name of `PRECISIONS`; reduced ones are made for GPUs and slower on the CPU.
-        capacity: on a GPU with the library, a number of rows, so that the host need not wait for N: the selected
-            Gaussians up to it, then zeros, which are culled. Without effect elsewhere.
+    Differentiable by weights, features, offsets and log-scales. `capacity`: on a GPU with the library, a number of
+    rows, so that the host need not wait for N: the selected Gaussians up to it, then zeros, which are culled.
 
     Returns:
         N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient;
         with a capacity N, [1] int64, else None.
     """
-    library = _library_for(anchors, precision)
+    library = _library_for(anchors)
     if library is None:
-        return *define_gaussians(weights, anchors, precision), None
+        return *define_gaussians(weights, anchors), None
     flat = tuple(tensor for head in weights for tensor in head)
     if library is cpu:
         *values, slots, raw = decode_on_cpu(flat, *anchors)
         return Gaussians(*values), slots, raw, None
     capacity = None if capacity is None else min(capacity, anchors.offsets[..., 0].numel())
-    *values, slots, raw, count = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision), capacity=capacity)
+    *values, slots, raw, count = decode_on_gpu(flat, *anchors, capacity=capacity)
     return Gaussians(*values), slots, raw, None if capacity is None else count
 
 
-def _library_for(anchors: SeenAnchors, precision: str) -> ModuleType | None:
+def _library_for(anchors: SeenAnchors) -> ModuleType | None:
     """Return the library that decodes these tensors; None: torch."""
-    dtype, library = reduced_dtype(precision), LIBRARIES.get(anchors.features.device.type)
-    no_reduced_types = dtype is not None and library is cpu
-    if library is None or no_reduced_types or anchors.features.dtype != torch.float32:
+    library = LIBRARIES.get(anchors.features.device.type)
+    if library is None or anchors.features.dtype != torch.float32:
         return None
     return library if library.works_on(anchors.features.device) else None
 
 
-def define_gaussians(
-    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
-) -> tuple[Gaussians, Tensor, Tensor]:
-    """Compute `decode_gaussians` in torch, for any dtype, precision and device."""
-    dtype, inputs = reduced_dtype(precision), torch.cat((anchors.features, anchors.seen), dim=-1)
-    raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
+def define_gaussians(weights: DecoderWeights, anchors: SeenAnchors) -> tuple[Gaussians, Tensor, Tensor]:
+    """Compute `decode_gaussians` in torch, for any dtype and device."""
+    inputs = torch.cat((anchors.features, anchors.seen), dim=-1)
+    raw_opacities = torch.tanh(weights.opacity(inputs))  # [A, K]
     slots = (raw_opacities.detach() > 0).view(-1).nonzero()[:, 0]
     rows = slots // anchors.offsets.shape[1]
-    colors = take_rows(weights.color(inputs, dtype).view(-1, COLOR_VALUES), slots)
-    covariances = weights.covariance(inputs, dtype).view(-1, COVARIANCE_VALUES)
+    colors = take_rows(weights.color(inputs).view(-1, COLOR_VALUES), slots)
+    covariances = weights.covariance(inputs).view(-1, COVARIANCE_VALUES)
     shrinkage, quats = take_rows(covariances, slots).split((3, 4), dim=-1)
     reach, size = take_rows(torch.exp(anchors.log_scales), rows).split((3, 3), dim=-1)
     gaussians = Gaussians(

@@ -32,14 +32,11 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float, far: float =
     """Return the mean of |second difference of 1 / r| / (1 / r) across and down, a scalar.
 
     Differentiable by `rendering.depth` only. Pixels are weighted by solid angle, by the opacity along all three rays,
-    less where the brightness bends, and less beyond `far`. For cameras other than panoramas all pixels weigh the same
-    and rows do not wrap.
+    and less where the brightness bends. For cameras other than panoramas all pixels weigh the same and rows do not
+    wrap.
 
-    Args:
-        rendering: of [H, W] pixels, in any unit of length.
-        camera: of the rendering.
-        near: > 0, lower limit of distances, in the same unit.
-        far: distance r beyond which the opacity counts times far / r: no view resolves the surface of the sky.
+    `near` > 0 is the lower limit of distances, in the unit of the depth. Beyond the distance `far`, the opacity counts
+    times far / r: no view resolves the surface of the sky.
     """
     depth, wraps = rendering.depth, isinstance(camera, Panorama)
     if far < math.inf:

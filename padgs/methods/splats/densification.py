@@ -110,10 +110,9 @@ class Densifier:
     ) -> None:
         """Start with empty statistics; `options` have iterations of the run, see `DensificationOptions.for_run`.
 
-        Args:
-            extent: length that sizes are compared with, world units.
-            target: number of Gaussians to reach by the last round, in equal steps; None: as many as thresholds give.
-            rendered_opacities: returns opacities [N] in [0, 1] after filters, at most the stored ones.
+        Sizes are compared with `extent`, world units. `target` is the number of Gaussians to reach by the last round,
+        in equal steps; None: as many as thresholds give. `rendered_opacities` returns opacities [N] in [0, 1] after
+        filters, at most the stored ones.
         """
         self._rendered_opacities = rendered_opacities or (lambda: torch.sigmoid(splats.opacity_logits))
         self.splats, self.options, self.extent = splats, options, extent

@@ -117,8 +117,7 @@ def plane_sweep(view: View, rays: Tensor, inverse_depth: Tensor, around: Tensor,
         rays: [n, 3] float64, of the pixels, camera frame.
         inverse_depth: [n] > 0, the initial estimate, 1 / world units.
         around: [n, K] > 0, of points around, which bound the candidates.
-        views: all views; those that are no panoramas or have no parallax are skipped. Masks are ignored: what they
-            hide is outvoted like an occlusion.
+        views: all views; those that are no panoramas or have no parallax are skipped, masks are ignored.
     """
     if not isinstance(view.camera, Panorama) or len(rays) == 0:
         return inverse_depth

@@ -99,13 +99,9 @@ class Splats(nn.Module):
     def displaced(self, view: View, mean_offsets: Tensor | None = None) -> tuple[Gaussians, Tensor | None]:
         """Return the Gaussians with their means displaced by offsets, which exist for their gradient.
 
-        Args:
-            view: camera that colours are seen from.
-            mean_offsets: [N, 3] along world axes in units of half the distance to the camera; or [N, 4], whose last
-                column receives absolute gradients in the same unit.
-
-        Returns:
-            Gaussians; the last column [N] in world units if there are four columns, else None.
+        Colours are those seen from the view. `mean_offsets` [N, 3] are along world axes in units of half the distance
+        to the camera; or [N, 4], whose last column receives absolute gradients in the same unit, and is returned [N] in
+        world units.
         """
         center, tiny = view.center.to(self.means), TINY * self.scene_scale
         if (call := native_call(self.means, center)) is not None:

@@ -220,25 +220,6 @@ def test_seeds_determine_the_networks():
     assert torch.equal(first, same) and not torch.equal(first, other)
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
-def test_reduced_precision_rounds_networks_only_and_keeps_float32_gradients(precision):
-    exact, rounded = (
-        perturbed(anchors.PaDGS.from_scene(box_scene(count=40), anchors.PaDGSOptions(precision=name)))
-        for name in ("float32", precision)
-    )
-    view, limit = box_scene().train[1], 8 * torch.finfo(getattr(torch, precision)).eps
-    truth, decoded = exact.decode(view), rounded.decode(view)
-    error = (decoded.raw_opacities - truth.raw_opacities).abs().max()
-    assert 1e-5 < error < limit and len(decoded.slots) == pytest.approx(len(truth.slots), rel=limit)
-    for model, seen in ((exact, truth), (rounded, decoded)):
-        gaussians = seen.gaussians
-        (gaussians.means.sum() + gaussians.opacities.sum() + gaussians.colors.sum() + gaussians.scales.sum()).backward()
-        assert all(p.grad is not None and p.grad.dtype == p.dtype == torch.float32 for p in model.parameters())
-    for mine, theirs in zip(rounded.parameters(), exact.parameters(), strict=True):
-        assert mine.grad is not None and theirs.grad is not None
-        assert (mine.grad - theirs.grad).norm() < 0.1 * theirs.grad.norm()
-
-
 def test_gradients_match_finite_differences():
     model = perturbed(
         anchors.PaDGS.from_scene(box_scene(count=4), anchors.PaDGSOptions(features=3, offsets=2, hidden=4))
@@ -271,7 +252,6 @@ class _Decode(torch.nn.Module):
         ({"omega_axis": "up"}, "omega_axis 'up'; known: camera_y, world_z"),
         ({"omega_input": "sin"}, "known: sin2, cos"),
         ({"distance_unit": "metre"}, "known: scene, world"),
-        ({"precision": "half"}, "unknown precision 'half'; known: float32, bfloat16, float16"),
         ({"voxel_size": "small"}, "known: auto"),
         ({"tau": 1.5}, r"tau is 1.5; it must be in \[0, 1\]"),
         ({"offsets": 0}, "offsets is 0"),

@@ -1,14 +1,12 @@
-"""The decoder, its native pass, and reduced precision."""
+"""The decoder and its native pass."""
 
 import math
 
 import pytest
 import torch
 from support.decoder_cases import EVERY_SIZE, assert_matches_definition, decoded, problem
-from torch import Tensor
 
 from padgs.methods.anchors.decoder import Decoder, Head, SeenAnchors, decode_gaussians, define_gaussians
-from padgs.methods.anchors.native_decoder import GRADIENT_TYPE, linear
 from padgs.native import cpu
 
 
@@ -99,76 +97,3 @@ def test_results_are_bit_equal_for_any_number_of_threads(generator):
         torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-each_reduced = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
-
-
-def roundoff(dtype: torch.dtype) -> float:
-    """Largest relative error of rounding to a type."""
-    return torch.finfo(dtype).eps / 2
-
-
-def layer(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Inputs [500, 37], weight [32, 37], bias [32]."""
-    inputs, weight = torch.randn(500, 37, generator=generator), torch.randn(32, 37, generator=generator)
-    return inputs, weight, torch.randn(32, generator=generator)
-
-
-@each_reduced
-def test_error_of_a_reduced_product_is_bounded_by_rounding(dtype: torch.dtype, generator):
-    inputs, weight, bias = (tensor.double() for tensor in layer(generator))
-    error = (linear(inputs.float(), weight.float(), bias.float(), dtype) - (inputs @ weight.T + bias)).abs()
-    magnitude = inputs.abs() @ weight.T.abs() + bias.abs()
-    assert (error <= 4 * roundoff(dtype) * magnitude).all()  # two operands and the result, and a bit for their products
-    assert error.max() > 0.1 * roundoff(dtype) * magnitude.max()  # not float32, which would be 2^13 times as exact
-    exact = (linear(inputs.float(), weight.float(), bias.float(), None) - (inputs @ weight.T + bias)).abs()
-    assert exact.max() < 1e-2 * error.max()
-
-
-@each_reduced
-@pytest.mark.parametrize("size", [1.0, 1e-9])  # of the upstream gradient; float16 ends at 6e-8
-def test_error_of_reduced_gradients_is_bounded_by_rounding_to_bfloat16(dtype: torch.dtype, size: float, generator):
-    inputs, weight, bias = (tensor.requires_grad_() for tensor in layer(generator))
-    upstream = size * torch.randn(500, 32, generator=generator)
-    gradients = torch.autograd.grad(linear(inputs, weight, bias, dtype), (inputs, weight, bias), upstream)
-    u, exact = roundoff(GRADIENT_TYPE), upstream.double()
-    for gradient, a, b in zip(gradients, (exact, exact.T), (weight.double(), inputs.double()), strict=False):
-        error, magnitude = (gradient - a @ b).abs(), a.abs() @ b.abs()
-        assert gradient.dtype == torch.float32 and (error <= 4 * u * magnitude).all()
-        assert error.max() > 1e-3 * u * magnitude.max()
-    torch.testing.assert_close(gradients[2], exact.sum(0).float(), rtol=1e-5, atol=1e-5 * size)
-
-
-@each_reduced
-def test_error_of_reduced_networks_is_bounded_by_rounding(dtype: torch.dtype, generator):
-    weights, inputs = Decoder(37, 10, generator=generator).weights(), torch.randn(400, 37, generator=generator)
-    u, bounds = roundoff(dtype), []
-    with torch.no_grad():
-        for head in weights:
-            w1, b1, w2, b2 = (tensor.double() for tensor in head)
-            x = inputs.double()
-            hidden = torch.relu(x @ w1.T + b1)
-            hidden_error = 4 * u * (x.abs() @ w1.T.abs() + b1.abs())
-            magnitude = (hidden + hidden_error) @ w2.T.abs() + b2.abs()
-            bounds.append(1.01 * hidden_error @ w2.T.abs() + 3 * u * magnitude)
-            assert ((head(inputs, dtype) - (hidden @ w2.T + b2)).abs() <= bounds[-1]).all()
-        found, truth = weights.opacity(inputs, dtype), weights.opacity(inputs)
-    sure = truth.abs() > bounds[0]
-    assert sure.float().mean() > 0.5 and torch.equal(found[sure] > 0, truth[sure] > 0)
-    assert not torch.equal(found, truth)
-
-
-@each_reduced
-def test_means_are_float32_in_reduced_precision(dtype: torch.dtype, generator: torch.Generator):
-    """Means come of no network: they are those of a float32 decode, bit by bit."""
-    tensors, decoder = problem(50, 10, 37, 32, generator)
-    ours, slots, *_ = decoded(define_gaussians, tensors, decoder, str(dtype).removeprefix("torch."))
-    truth, true_slots, *_ = decoded(define_gaussians, tensors, decoder)
-    shared = slots[torch.isin(slots, true_slots)]
-    assert len(shared) > 0.9 * len(true_slots) > 0
-    places, true_places = torch.searchsorted(slots, shared), torch.searchsorted(true_slots, shared)
-    assert torch.equal(ours.means[places], truth.means[true_places])
-    for field in ("quats", "scales", "opacities", "colors"):
-        values = getattr(ours, field)
-        assert values.dtype == torch.float32 and not torch.equal(values[places], getattr(truth, field)[true_places])

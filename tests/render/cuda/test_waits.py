@@ -5,7 +5,6 @@ Numbers that are read beside the drawing (`HostCopy`) are no wait: the device go
 
 from collections import Counter
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import islice
 
 import pytest
@@ -17,7 +16,6 @@ from torch import Tensor
 from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.method import AnchorModel
-from padgs.methods.anchors.native_decoder import PRECISIONS
 from padgs.methods.splats.densification import POSITIONAL_GRADIENTS, DensificationOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
@@ -44,10 +42,9 @@ def kernels_are_there(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cuda_backend, "_capacities", {})
 
 
-def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
+def trained() -> tuple[Trainer, list[Counter[str]]]:
     """Return what made the host wait in each of several iterations without densification."""
     work = build(SIZE)
-    work.model.options = replace(work.model.options, precision=precision)
     with pretended_gpu() as waits:
         growth = GrowthOptions(statistics_from=0, grow_until=10**6, grow_from=10**6)
         anchors = work.model.to(GPU)
@@ -83,13 +80,12 @@ def learned(trainer: Trainer) -> dict[str, Tensor]:
         return {name: tensor.cpu() for name, tensor in trainer.state().tensors.items()}
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_padgs_iterations_do_not_wait(precision: str, monkeypatch: pytest.MonkeyPatch):
-    trainer, waited = trained(precision)
+def test_padgs_iterations_do_not_wait(monkeypatch: pytest.MonkeyPatch):
+    trainer, waited = trained()
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts Gaussians and instances
     ahead = learned(trainer)
     monkeypatch.setattr("padgs.methods.anchors.method.resolve_backend", lambda *_: "another")
-    exact, waited = trained(precision)
+    exact, waited = trained()
     assert all(waited), "with as many rows as there are Gaussians it waits"
     for name, tensor in learned(exact).items():
         assert torch.equal(ahead[name], tensor), name
@@ -97,9 +93,9 @@ def test_padgs_iterations_do_not_wait(precision: str, monkeypatch: pytest.Monkey
 
 
 def test_too_small_capacity_changes_nothing(monkeypatch: pytest.MonkeyPatch):
-    enough = learned(trained("float32")[0])
+    enough = learned(trained()[0])
     monkeypatch.setattr("padgs.methods.anchors.method.HEADROOM", 0.5)
-    trainer, waited = trained("float32")
+    trainer, waited = trained()
     assert any(waited[2:]), "it was decoded once more"
     for name, tensor in learned(trainer).items():
         assert torch.equal(enough[name], tensor), name
