@@ -28,9 +28,7 @@ class EgoNeRFMethod(Method):
         if budget.gaussians is not None:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
         if budget.stop == "auto":
-            raise ValueError(
-                "budget.stop is auto, which needs validation views, but rays come from all views; set it to end"
-            )
+            raise ValueError("budget.stop is auto, which needs validation views, but rays come from all; set it to end")
 
     def refuse_search(self) -> None:
         """Refuse: there are no Gaussians."""

@@ -26,9 +26,8 @@ from padgs.training.model import Model
 from padgs.training.options import Budget
 
 GOLDEN = (1 + math.sqrt(5)) / 2
-ICOSAHEDRON = [
-    vertex for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN) for vertex in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
-]
+CORNERS = [(a, b) for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN)]
+ICOSAHEDRON = [vertex for a, b in CORNERS for vertex in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]
 # Degrees across each square crop. Below 74.75, twice the angle between a vertex and the centre of a face, crops would
 # not cover the sphere.
 FIELD_OF_VIEW = 75.0

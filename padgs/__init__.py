@@ -42,9 +42,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return import_module("importlib.metadata").version("padgs")
     if name not in _HOMES:
-        raise AttributeError(
-            f"padgs has no {name!r}; it offers {', '.join(_HOMES)}, and its rooms, such as padgs.render"
-        )
+        raise AttributeError(f"padgs has no {name!r}; it offers {', '.join(_HOMES)}, and packages as padgs.render")
     module, attribute = _HOMES[name]
     return getattr(import_module(module), attribute)
 

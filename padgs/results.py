@@ -277,12 +277,8 @@ def _refuse_impossible(result: Result) -> None:
             raise ValueError(f"timing.{name} is {value}; it must be a time, at least 0")
     if result.external.keys() - EXTERNAL or not all(isinstance(text, str) for text in result.external.values()):
         raise TypeError(f"external is {result.external!r}; it must be texts named {', '.join(EXTERNAL)}")
-    names = [
-        *vars(result).values(),
-        *result.external.values(),
-        *(view for scores in result.scores.values() for view in scores.views),
-    ]
-    for name in names:
+    views = (view for scores in result.scores.values() for view in scores.views)
+    for name in (*vars(result).values(), *result.external.values(), *views):
         if isinstance(name, str) and name != result.reason and len(name) > LONGEST_NAME:
             raise ValueError(f"{name[:20]}... has {len(name)} letters; names have at most {LONGEST_NAME}")
     for name in CONFIG_GROUPS & result.config.keys():

@@ -40,9 +40,7 @@ class FarPanorama:
 
     def draw(self, view: View) -> TrainingRender:
         """Render a view of any camera, differentiably."""
-        directions = (
-            view.camera.rays() @ view.cam_from_world[:3, :3].float()
-        )  # in the world; its origin does not matter
+        directions = view.camera.rays() @ view.cam_from_world[:3, :3].float()  # world axes; the origin does not matter
         zeros = torch.zeros(view.height, view.width)
         image = sample(self.pixels, directions)
         return TrainingRender.of_pixels(Rendering(image, zeros, zeros, torch.zeros(1, dtype=torch.bool)))

@@ -14,9 +14,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     frames = []
     try:
         for row in csv.DictReader((path / "poses.csv").read_text("utf-8").splitlines()):
-            turn, center = (
-                torch.tensor([float(row[key]) for key in keys.split()]) for keys in ("qw qx qy qz", "x y z")
-            )
+            groups = ("qw qx qy qz", "x y z")
+            turn, center = (torch.tensor([float(row[key]) for key in keys.split()]) for keys in groups)
             pose = cam_from_panorama(turn.double(), center.double(), row["name"])
             frames.append(Frame(row["name"], path / "images" / row["name"], pose))
     except (OSError, KeyError, ValueError) as error:

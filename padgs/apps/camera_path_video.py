@@ -181,14 +181,12 @@ def _folder(path: Path, description: str) -> Iterator[WriteFrame]:
 def _mp4(path: Path, view: View, fps: float, spherical: bool) -> Iterator[WriteFrame]:
     if view.width % 2 or view.height % 2:
         raise ValueError(
-            f"frames are {view.width}x{view.height}; H.264 supports even sides only: choose even sides, or a folder"
+            f"frames are {view.width}x{view.height}; H.264 needs even sides: change them, or give a folder"
         )
     try:
         import av
     except ImportError as error:
-        raise ValueError(
-            f"writing {path} needs PyAV: {install_command('video')}; a folder for PNGs does not"
-        ) from error
+        raise ValueError(f"writing {path} needs PyAV: {install_command('video')}; or give a folder for PNGs") from error
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as draft:
         with av.open(str(draft), "w") as video:

@@ -248,9 +248,8 @@ class Renders:
             else:
                 files[view.name] = found
         if missing:
-            raise DataError(
-                f"{folder} lacks {len(missing)} of {len(scene.test)} test views: {listed(missing)}; render them all"
-            )
+            lost = f"{len(missing)} of {len(scene.test)} test views"
+            raise DataError(f"{folder} lacks {lost}: {listed(missing)}; render them all")
         for view in scene.test:
             with open_image(path := files[view.name]) as image:
                 if image.size != (view.width, view.height):

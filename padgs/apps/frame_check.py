@@ -178,10 +178,8 @@ def _worlds(scene: Scene, means: Tensor, nerfstudio: Similarity | None) -> Itera
         yield "with other axes", Similarity(1.0, turn, torch.zeros(3).double())
     starts = [_closest_points(scene.points, means, Similarity(0.0, turn, torch.zeros(3)), *COARSE) for turn in turns]
     for _, start in sorted(starts, key=lambda found: found[0])[:FINALISTS]:
-        yield (
-            "with another scale and place (estimated from points)",
-            _closest_points(scene.points, means, start, *FINE)[1],
-        )
+        aligned = _closest_points(scene.points, means, start, *FINE)[1]
+        yield "with another scale and place (estimated from points)", aligned
 
 
 def _axis_rotations() -> Sequence[np.ndarray]:

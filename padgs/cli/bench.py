@@ -29,9 +29,8 @@ def bench(
     check_range(0, MAX_SEED, seed=seed)
     usual = QUICK if quick else BenchOptions(repeats=10 if device == "cpu" else 50)
     sizes = (*usual.sizes, "large") if full else usual.sizes
-    options = replace(
-        usual, sizes=sizes, device=device, threads=threads or None, repeats=repeats or usual.repeats, seed=seed
-    )
+    counts = {"threads": threads or None, "repeats": repeats or usual.repeats}
+    options = replace(usual, sizes=sizes, device=device, seed=seed, **counts)
     file, console = Path(out) / "bench.json", Console(highlight=False)
     with console.status("measuring") as status, name_place(file, "--out"):
         report = measure_all(options, lambda what: status.update(f"measuring {what}"), file)

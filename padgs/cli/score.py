@@ -57,9 +57,8 @@ def score(
             scene = replace(scene, test=tuple(replace(view, load_depth=None) for view in scene.test))
             config = replace(config, options=ExternalOptions(renders.digest()))
             render, program = renders.render, ("", "")
-            notes = [f"{len(renders.extra)} files belong to no test view, such as {renders.extra[0]}"] * any(
-                renders.extra
-            )
+            extra = renders.extra
+            notes = [f"{len(extra)} files belong to no test view, such as {extra[0]}"] if extra else []
         else:
             opened = ExternalRun.open(path, config, rays, transform, device)
             config, scene, program, notes = opened.config, opened.scene, opened.program, [*opened.notes]

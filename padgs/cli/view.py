@@ -41,11 +41,8 @@ def view(
         place = data or next((folder for folder in folders if not is_splat_file(folder)), None)
         for folder in folders:
             wait_for_checkpoint(folder)
-            found = (
-                open_model(folder, place, rays, transform)
-                if is_splat_file(folder)
-                else load_run(folder, data_path=data)
-            )
+            is_file = is_splat_file(folder)
+            found = open_model(folder, place, rays, transform) if is_file else load_run(folder, data_path=data)
             for note in getattr(found, "notes", ()):
                 show(f"  {note}")
             runs.append(found)

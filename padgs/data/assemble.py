@@ -46,24 +46,16 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     unposed = _unposed(capture)
     if unposed:
         notes.append(f"{len(unposed)} images have no pose and are not used: {listed(unposed)}")
-    split = split_frames(
-        names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split, unposed=unposed
-    )
+    rules = {"mode": options.split, "every": options.test_every, "stated": capture.split}
+    split = split_frames(names, capture.folder, unposed=unposed, **rules)
     points, colors, cloud_notes = initial_cloud(capture, options.points)
     folder, cache_notes = disk_cache(options, 3 * sum(width * height for width, height in sizes))
     store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device, folder)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
-    views = [
-        View(
-            view_name(frame.name),
-            frame.cam_from_world,
-            *size,
-            StoredImage(frame.image, *size, store),
-            mask,
-            share=frame.share,
-        )
-        for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
-    ]
+    views = []
+    for frame, size, mask in zip(capture.frames, sizes, masks, strict=True):
+        pixels = StoredImage(frame.image, *size, store)
+        views.append(View(view_name(frame.name), frame.cam_from_world, *size, pixels, mask, share=frame.share))
     views, depth_digests, depth_notes = with_depths(views, capture, options)
     scene = Scene(
         name=capture.name or Path(os.path.abspath(capture.folder)).name,  # works for "." too; a link keeps its name
@@ -100,9 +92,8 @@ def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]
         folder.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        raise DataError(
-            f"data.disk_cache: cannot write {folder}: {error.strerror}; name another folder, or off"
-        ) from error
+        why = f"cannot write {folder}: {error.strerror}"
+        raise DataError(f"data.disk_cache: {why}; name another folder, or off") from error
     gigabytes = f"{size / 1e9:.1f} GB of decoded images exceed data.cache_bytes"
     if 2 * size > free:
         return None, [f"images: {gigabytes} and half of the free space of {folder}; each is decoded when it is needed"]
@@ -153,9 +144,8 @@ def refuse_clashes(names: Sequence[str]) -> None:
     for name in names:
         key = view_name(name).casefold()
         if key in seen:
-            raise DataError(
-                f"the images {seen[key]!r} and {name!r} would share one name (without case and extension); rename one"
-            )
+            both = f"{seen[key]!r} and {name!r}"
+            raise DataError(f"the images {both} would share one name (without case and extension); rename one")
         seen[key] = name
 
 
@@ -219,10 +209,8 @@ def _refuse_missing(capture: Capture) -> None:
         remedy = f"there is {hint!r}, which differs in case: rename it"
     elif elsewhere:
         remedy = f"{capture.folder / elsewhere} has the name of one: set data.images to the folder that holds them"
-    raise DataError(
-        f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}: "
-        f"{listed(absent)}; {remedy}"
-    )
+    lost = f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}"
+    raise DataError(f"{lost}: {listed(absent)}; {remedy}")
 
 
 def _unposed(capture: Capture) -> list[str]:
@@ -240,14 +228,11 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
             continue
         if frame.width != 2 * frame.height or frame.width < 1:
             raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; a full panorama is 2:1")
-        scales.setdefault(
-            image.width / frame.width,
-            f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}",
-        )
+        text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
+        scales.setdefault(image.width / frame.width, text)
     if len(scales) > 1:
-        raise DataError(
-            f"images and cameras disagree in size: {'; but '.join(list(scales.values())[:2])}; make them agree"
-        )
+        differ = "; but ".join(list(scales.values())[:2])
+        raise DataError(f"images and cameras disagree in size: {differ}; make them agree")
     return [f"images: {text}; used as they are" for scale, text in scales.items() if scale != 1]
 
 

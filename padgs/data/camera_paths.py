@@ -88,9 +88,7 @@ def along_cameras(scene: Scene, frames: int) -> Tensor:
     centers = torch.stack([view.center for view in views])
     steps = (centers[1:] - centers[:-1]).norm(dim=-1).cpu().numpy()
     if len(given) < 2 or scene.has_single_center:
-        raise ValueError(
-            f"{len(given)} training cameras with one centre make no path; use --path orbit or --path dolly"
-        )
+        raise ValueError(f"{len(given)} training cameras with one centre make no path; use --path orbit or dolly")
     distance = np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-9 * steps.max()))))
     times = np.interp(np.linspace(0, distance[-1], frames), distance, np.arange(len(distance)))
     poses = interpolate_poses(given, times).numpy()
@@ -118,11 +116,8 @@ def dolly(scene: Scene, frames: int) -> Tensor:
     middle, up, forward = _frame(scene)
     centers = torch.stack([view.center for view in scene.train]).cpu().numpy()
     along = (centers - middle) @ forward
-    reach = (
-        (along.min(), along.max())
-        if not scene.has_single_center
-        else (-SINGLE_CENTER_RADIUS * scene.scale, SINGLE_CENTER_RADIUS * scene.scale)
-    )
+    single = SINGLE_CENTER_RADIUS * scene.scale
+    reach = (-single, single) if scene.has_single_center else (along.min(), along.max())
     at = middle + np.linspace(*reach, frames)[:, None] * forward
     return look_along(at, np.broadcast_to(forward, at.shape), up)
 

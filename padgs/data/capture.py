@@ -158,13 +158,9 @@ class DataSettings:
         if self.depth not in ("auto", "none"):
             raise DataError(f"unknown data.depth {self.depth!r}; known: auto, none")
         if self.test_every < 2:
-            raise DataError(
-                f"data.test_every is {self.test_every}; every k-th view is a test view, k must be 2 or more"
-            )
+            raise DataError(f"data.test_every is {self.test_every}; every k-th view is a test view, with k at least 2")
         if self.width is not None and (self.width < 8 or self.width % 2):
-            raise DataError(
-                f"data.width is {self.width}; a panorama is twice as wide as high: give an even number >= 8"
-            )
+            raise DataError(f"data.width is {self.width}; a panorama is 2:1: give an even number >= 8")
         for name in ("cache_bytes", "prefetch_threads"):
             if getattr(self, name) < 0:
                 raise DataError(f"data.{name} is {getattr(self, name)}; it must be 0, which switches it off, or more")

@@ -95,9 +95,8 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
     except KeyError as error:
         raise DataError(f"{path} has no element 'vertex'; it must be a point cloud") from error
     except (PlyParseError, OSError, ValueError, MemoryError, OverflowError, EOFError) as error:
-        raise DataError(
-            f"{path} is not a readable PLY file ({error or type(error).__name__}); export it again"
-        ) from error
+        why = error or type(error).__name__
+        raise DataError(f"{path} is not a readable PLY file ({why}); export it again") from error
     return vertex, {prop.name for prop in vertex.properties if not isinstance(prop, PlyListProperty)}
 
 
@@ -131,16 +130,12 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
         (cloud, notes), where = read_cloud(path), str(path)
     elif source == "random" or cloud is None:
         cloud = random_cloud(torch.stack([frame.cam_from_world for frame in capture.frames]))
-        why = (
-            "data.points=random"
-            if source == "random"
-            else f"{capture.format} holds none; set data.points to a PLY file"
-        )
+        why = "data.points=random" if source == "random" else f"{capture.format} holds none; set data.points to a file"
         notes = (f"points: {RANDOM_POINTS} random points around the cameras ({why})",)
     points, colors = cloud.points, cloud.colors
     if not len(points):
         raise DataError(
-            f"{where} holds no points; training starts from a point cloud: set data.points to a PLY file, or to random"
+            f"{where} holds no points, from which training starts; set data.points to a PLY file, or random"
         )
     bad = (~points.float().isfinite().all(1)).sum().item()
     if bad:

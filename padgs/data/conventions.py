@@ -99,9 +99,8 @@ def best_reading(capture: Capture) -> Capture:
             best = readings[fits.index(max(fits))]
         why = f"colours agree by {max(fits):.2f}" if max(fits) > MIN_CORRELATION else "not tested by colours"
         notes.append(f"{best.words}: {why}")
-    frames = (
-        replace(frame, cam_from_world=best.axes @ pose) for frame, pose in zip(capture.frames, poses, strict=True)
-    )
+    posed = zip(capture.frames, poses, strict=True)
+    frames = (replace(frame, cam_from_world=best.axes @ pose) for frame, pose in posed)
     cloud = cloud and replace(cloud, points=_moved(cloud.points, best))
     return replace(capture, frames=tuple(frames), cloud=cloud, notes=tuple(notes), readings=())
 
@@ -123,8 +122,10 @@ def known_conventions() -> list[Convention]:
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
         "the rotations are transposed: transpose them and keep the centres": _transposed,
-        "the translations are camera centres: use t = -R t": _from_center,
-        "the camera centres are translations: use C = -R^T C": _to_center,
+        "the translations are camera centres: use t = -R t": lambda p: _with(
+            p, p[:, :3, :3], -p[:, :3, :3] @ p[:, :3, 3:]
+        ),
+        "the camera centres are translations: use C = -R^T C": lambda p: _with(p, p[:, :3, :3], centers(p)[..., None]),
         "the quaternions are in the order x y z w: write them as w x y z": _reordered,
     }
     same, *others = _signed_axes()
@@ -155,14 +156,6 @@ def _signed_axes() -> Iterator[tuple[str, Tensor]]:
 def _transposed(poses: Tensor) -> Tensor:
     transposed = poses[:, :3, :3].mT
     return _with(poses, transposed, -transposed @ centers(poses)[..., None])
-
-
-def _from_center(poses: Tensor) -> Tensor:
-    return _with(poses, poses[:, :3, :3], -poses[:, :3, :3] @ poses[:, :3, 3:])
-
-
-def _to_center(poses: Tensor) -> Tensor:
-    return _with(poses, poses[:, :3, :3], centers(poses)[..., None])
 
 
 def _reordered(poses: Tensor) -> Tensor:

@@ -130,7 +130,7 @@ def read_depth(file: Path) -> NDArray[np.float32]:
         values = values[..., 0]
     if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
         raise DataError(
-            f"{file} is an array of {values.dtype} {list(values.shape)}; it must be [height, width] numbers"
+            f"{file} is {values.dtype} {list(values.shape)}; it must be an array [height, width] of numbers"
         )
     return values.astype(np.float32)
 
@@ -162,9 +162,8 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
                 "data.depth=none"
             )
         return named, capture.depth if named else None
-    for folder in dict.fromkeys(
-        base / name for base in (capture.folder, capture.image_folder.parent) for name in FOLDERS
-    ):
+    places = (capture.folder, capture.image_folder.parent)
+    for folder in dict.fromkeys(base / name for base in places for name in FOLDERS):
         there = {
             path.relative_to(folder).with_suffix("").as_posix(): path
             for path in sorted(folder.rglob("*"))

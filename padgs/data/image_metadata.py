@@ -64,10 +64,8 @@ def load_late_chunks(image: Image.Image, data: bytes) -> None:
 def refuse_rotated(image: Image.Image, path: object) -> None:
     """Refuse pixels that are stored rotated, by EXIF or XMP."""
     has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
-    orientations = {
-        "EXIF": image.getexif().get(_ORIENTATION) if has_exif else 1,
-        "XMP": stated(_xmp(image), "Orientation"),
-    }
+    by_exif = image.getexif().get(_ORIENTATION) if has_exif else 1
+    orientations = {"EXIF": by_exif, "XMP": stated(_xmp(image), "Orientation")}
     for source, orientation in orientations.items():
         if str(orientation) not in ("None", "0", "1"):
             raise DataError(
@@ -124,9 +122,8 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
         return None
     scale = image.width / width
     left, top, full_width, full_height = (round(scale * value) for value in (left, top, full_width, full_height))
-    return Crop(
-        left, top, image.width, image.height, max(full_width, left + image.width), max(full_height, top + image.height)
-    )
+    full = (max(full_width, left + image.width), max(full_height, top + image.height))
+    return Crop(left, top, image.width, image.height, *full)
 
 
 def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:

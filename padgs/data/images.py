@@ -112,9 +112,8 @@ def notes_on(images: Sequence[ImageFile]) -> list[str]:
 def refuse_other_shapes(width: int, height: int, path: Path) -> None:
     """Refuse image sizes that are not 2:1."""
     if width != 2 * height or not height:
-        eyes = {1: "one above the other", 4: "side by side"}.get(
-            width // height if height and width % height == 0 else 0
-        )
+        ratio = width // height if height and width % height == 0 else 0
+        eyes = {1: "one above the other", 4: "side by side"}.get(ratio)
         stereo = f"; if it holds two panoramas {eyes} (stereo), cut out one" if eyes else ""
         raise DataError(
             f"{path} is {width}x{height}, which is not 2:1; an equirectangular panorama covers 360 x 180 degrees "

@@ -179,7 +179,7 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     residual = (turn * ours - theirs).abs().square().mean().sqrt().item()
     if not spread >= _MIN_SPREAD:
         raise DataError(
-            f"--gps: the positions spread by {spread:.2g} m, and at least {_MIN_SPREAD:g} m are needed{instead}"
+            f"--gps: the positions spread by {spread:.2g} m; at least {_MIN_SPREAD:g} m are needed{instead}"
         )
     if not residual <= _MAX_RESIDUAL * spread:
         raise DataError(

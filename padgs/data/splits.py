@@ -52,9 +52,7 @@ def split_frames(
         origin = " and ".join(LISTS[side] for side in lists)
     if not lists:
         if mode == "files":
-            raise DataError(
-                f"data.split=files, but {folder} holds neither train.txt nor test.txt; write them or use every"
-            )
+            raise DataError(f"data.split=files, but {folder} has no train.txt and test.txt; write them or use every")
         return _every(names, every, mode)
     chosen = {side: _resolve(lines, names, f"{side} list", unposed) for side, lines in lists.items()}
     notes = [f"split: {origin}"]
@@ -64,9 +62,8 @@ def split_frames(
             notes.append(f"there is no {side} list; all views missing from the {other} list are used")
     both = chosen["train"] & chosen["test"]
     if both:
-        raise DataError(
-            f"train and test list overlap: {listed(names[i] for i in sorted(both))}; a view is one or the other"
-        )
+        overlap = listed(names[i] for i in sorted(both))
+        raise DataError(f"train and test list overlap: {overlap}; a view is one or the other")
     for side in ("train", "test"):
         if not chosen[side]:
             raise DataError(f"the {side} split is empty; name at least one view, or set data.split=every")
@@ -123,9 +120,7 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
     test = tuple(range(0, len(names), every))
     train = tuple(i for i in range(len(names)) if i % every)
     if not train:
-        raise DataError(
-            f"{len(names)} posed view(s) cannot be split; at least 2 are needed to train on one and test on one"
-        )
+        raise DataError(f"{len(names)} posed view(s) cannot be split; at least 2 are needed, to train and to test on")
     why = "no train.txt or test.txt" if mode == "auto" else "data.split=every"
     return Split(train, test, (f"split: every {every}th view is a test view ({why})",))
 
@@ -141,9 +136,8 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
     for line in lines:
         found = next((meant[key] for key in spellings(line) if key in meant), set())
         if len(found) > 1:
-            raise DataError(
-                f"the {which} names {line!r}, which matches {listed(names[i] for i in sorted(found))}; be specific"
-            )
+            matches = listed(names[i] for i in sorted(found))
+            raise DataError(f"the {which} names {line!r}, which matches {matches}; be specific")
         if not found:
             absent.append(line)
         chosen |= found
@@ -152,7 +146,5 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
         without = [line for line in absent if known & set(spellings(line))]
         if without:
             raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
-        raise DataError(
-            f"the {which} names images that do not exist: {listed(absent)}; the data set has {listed(names)}"
-        )
+        raise DataError(f"the {which} names images that do not exist: {listed(absent)}; there are {listed(names)}")
     return chosen

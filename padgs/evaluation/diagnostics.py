@@ -39,10 +39,8 @@ def depth_scores(view: View, rendering: Rendering, mask: Tensor | None = None) -
     depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
     if mask is not None:
         truth = torch.where(mask > 0, truth, 0)
-    return {
-        "abs_rel": finite_or_none(depth_error(depth, truth)),
-        "delta_1_25": finite_or_none(depth_within(depth, truth)),
-    }
+    found = {"abs_rel": depth_error(depth, truth), "delta_1_25": depth_within(depth, truth)}
+    return {name: finite_or_none(value) for name, value in found.items()}
 
 
 def depth_error(depth: Tensor, truth: Tensor) -> Tensor:

@@ -108,9 +108,8 @@ def quantized(image: Tensor) -> Tensor:
 def checked(image: Tensor, view: View) -> Tensor:
     """Return the image; ValueError for another size than the view's, Failure for non-finite values."""
     if tuple(image.shape) != (view.height, view.width, 3):
-        raise ValueError(
-            f"render of {view.name!r} has shape {tuple(image.shape)}; the view is {view.height}x{view.width}x3"
-        )
+        shape = tuple(image.shape)
+        raise ValueError(f"render of {view.name!r} has shape {shape}; the view is {view.height}x{view.width}x3")
     bad = int((~torch.isfinite(image)).sum())
     if bad:
         raise Failure("nan", f"render of view {view.name!r} has {bad} non-finite values")

@@ -101,9 +101,8 @@ class LPIPS(nn.Module):
         """Return the weighted squared distance of the features of two images at each tap, [1, 1, h, w]."""
         smallest, (height, width, _) = self.network.smallest_side, image.shape
         if min(height, width) < smallest:
-            raise LpipsUnavailable(
-                f"LPIPS {self.network.name} needs at least {smallest} pixels per side; image is {width}x{height}"
-            )
+            needs = f"LPIPS {self.network.name} needs at least {smallest} pixels per side"
+            raise LpipsUnavailable(f"{needs}; image is {width}x{height}")
         if inputs not in INPUTS:
             raise ValueError(f"unknown LPIPS input {inputs!r}; known: {', '.join(INPUTS)} ([-1, 1] and [0, 1])")
         fed = (2 * image - 1, 2 * target - 1) if inputs == "11" else (image, target)

@@ -31,10 +31,8 @@ def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
 
 def direction(longitude: Tensor, latitude: Tensor) -> Tensor:
     """Return the unit direction [..., 3] in the camera frame of a longitude and latitude in radians (inverse Eq. 6)."""
-    cos_latitude = torch.cos(latitude)
-    return torch.stack(
-        (cos_latitude * torch.sin(longitude), torch.sin(latitude), cos_latitude * torch.cos(longitude)), dim=-1
-    )
+    flat = torch.cos(latitude)
+    return torch.stack((flat * torch.sin(longitude), torch.sin(latitude), flat * torch.cos(longitude)), dim=-1)
 
 
 def pixel_from_angles(longitude: Tensor, latitude: Tensor, width: int, height: int) -> Tensor:
@@ -94,9 +92,8 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
     zero = torch.zeros_like(x)
     # down = latitude direction: -sin(latitude) * horizontal + cos(latitude) * y; horizontal = (-east_z, 0, east_x).
     row_u = torch.stack((per_east * east_x, zero, per_east * east_z), dim=-1)
-    row_v = torch.stack(
-        (per_down * sin_latitude * east_z, per_down * cos_latitude, -per_down * sin_latitude * east_x), dim=-1
-    )
+    along = per_down * sin_latitude
+    row_v = torch.stack((along * east_z, per_down * cos_latitude, -along * east_x), dim=-1)
     return torch.stack((row_u, row_v), dim=-2)
 
 
@@ -127,9 +124,8 @@ def sample_bicubic(image: Tensor, directions: Tensor) -> Tensor:
 
 def _bicubic_weights(t: Tensor) -> Tensor:
     """Return weights [..., 4] of the pixels -1, 0, 1 and 2 for positions t in [0, 1) after pixel 0."""
-    return torch.stack(
-        (((2 - t) * t - 1) * t, (3 * t - 5) * t * t + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t * t), dim=-1
-    ).div(2)
+    weights = (((2 - t) * t - 1) * t, (3 * t - 5) * t * t + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t * t)
+    return torch.stack(weights, dim=-1).div(2)
 
 
 def pad_panorama(image: Tensor, margin: int) -> Tensor:

@@ -33,17 +33,11 @@ class NativeCamera(ctypes.Structure):
 
 
 class TileGrid(ctypes.Structure):
-    _fields_ = [
-        *fields(Int32, "width", "height", "first_row", "end_row"),
-        *fields(Pointer, "level", "row_start"),
-    ]
+    _fields_ = [*fields(Int32, "width", "height", "first_row", "end_row"), *fields(Pointer, "level", "row_start")]
 
 
 class Inputs(ctypes.Structure):
-    _fields_ = [
-        ("count", Int64),
-        *fields(Pointer, "means", "quats", "scales", "opacities", "colors", "mean_offsets"),
-    ]
+    _fields_ = [("count", Int64), *fields(Pointer, "means", "quats", "scales", "opacities", "colors", "mean_offsets")]
 
 
 class Gradients(ctypes.Structure):

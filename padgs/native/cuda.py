@@ -29,9 +29,7 @@ class TileTable(ctypes.Structure):
 
 class ProjectArguments(ctypes.Structure):
     _fields_ = [
-        ("camera", abi.NativeCamera),
-        ("pose", Pointer),
-        ("inputs", abi.Inputs),
+        *(("camera", abi.NativeCamera), ("pose", Pointer), ("inputs", abi.Inputs)),
         *fields(Pointer, "footprints", "boxes", "depth_keys", "indices"),
         ("table", TileTable),
         ("counts", Pointer),
@@ -40,11 +38,8 @@ class ProjectArguments(ctypes.Structure):
 
 class ProjectGradientArguments(ctypes.Structure):
     _fields_ = [
-        ("camera", abi.NativeCamera),
-        ("pose", Pointer),
-        ("inputs", abi.Inputs),
-        ("moments", Pointer),
-        ("out", abi.Gradients),
+        *(("camera", abi.NativeCamera), ("pose", Pointer), ("inputs", abi.Inputs)),
+        *(("moments", Pointer), ("out", abi.Gradients)),
     ]
 
 

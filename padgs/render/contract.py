@@ -62,9 +62,7 @@ class RenderOptions:
         check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", lambda n: 1 <= n <= MAX_CORE_SIZE, "core_size")
         check(self, "at least 1", lambda most: most >= 1, "max_instances")
         if self.near_cull == "ellipsoid" and self.projection != "ray":
-            raise ValueError(
-                f"near_cull=ellipsoid requires projection 'ray', not {self.projection!r}; set near_cull=mean"
-            )
+            raise ValueError(f"near_cull=ellipsoid requires projection 'ray', not {self.projection!r}; set mean")
         if self.core_size != CORE_SIZE and self.blending != "hybrid":
             raise ValueError(
                 f"core_size is {self.core_size}, but blending={self.blending} has no core; set blending=hybrid "
@@ -81,9 +79,7 @@ class RenderOptions:
                 f"{', '.join(kinds)}"
             )
         if self.cubemap and self.projection == "erp":
-            raise ValueError(
-                "projection 'erp' cannot render the faces of a cubemap; set projection to pinhole, tangent or ray"
-            )
+            raise ValueError("projection 'erp' cannot render the faces of a cubemap; set pinhole, tangent or ray")
 
     def on_finer_pixels(self, times: float) -> RenderOptions:
         """Return options with the same low-pass angle for a camera with `times` the pixels per radian."""
@@ -196,9 +192,7 @@ def check_camera(camera: Camera, options: RenderOptions) -> None:
     kind = {"erp": Panorama, "pinhole": Pinhole}.get(options.projection)
     if options.cubemap:
         if not isinstance(camera, Panorama):
-            raise ValueError(
-                f"a cubemap is resampled to a Panorama, not to a {type(camera).__name__}; set cubemap=false"
-            )
+            raise ValueError(f"a cubemap gives a Panorama, not a {type(camera).__name__}; set cubemap=false")
     elif kind is not None and not isinstance(camera, kind):
         way_out = "; or set cubemap=true" if kind is Pinhole and isinstance(camera, Panorama) else ""
         raise ValueError(

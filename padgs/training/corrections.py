@@ -148,9 +148,8 @@ class PoseRefinement(nn.Module):
         growth = (moves * beside).sum() / beside.square().sum().clamp(min=torch.finfo(beside.dtype).tiny)
         imaginary = imaginary + 0.5 * real * _each(rotations, turn)
         shifts = -_each(rotations, moves - growth * beside) / self.scale
-        for mine, new in zip(
-            [*self.quaternions, *self.shifts], [*torch.cat((real, imaginary), -1), *shifts], strict=True
-        ):
+        changed = (*torch.cat((real, imaginary), -1), *shifts)
+        for mine, new in zip((*self.quaternions, *self.shifts), changed, strict=True):
             mine.copy_(new)
 
     @torch.no_grad()
@@ -163,9 +162,8 @@ class PoseRefinement(nn.Module):
     def summary(self) -> str:
         """Return the median correction as a sentence, without a similarity of the whole world."""
         left = align(self.poses(), self.given)[1]
-        return (
-            f"poses moved by {left.distance.median():.3g} world units and {left.degrees.median():.3g} degrees (median)"
-        )
+        distance, degrees = left.distance.median(), left.degrees.median()
+        return f"poses moved by {distance:.3g} world units and {degrees:.3g} degrees (median)"
 
 
 def _corrected(given: Tensor, quaternions: Tensor, shifts: Tensor) -> Tensor:

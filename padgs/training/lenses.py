@@ -54,12 +54,10 @@ class CameraMap(nn.Module):
         self.offsets = nn.Parameter(torch.zeros(height, width, 3, dtype=dtype))
         directions = rays(width, height, dtype=dtype)
         weight = solid_angle_weight(height, dtype=dtype)[:, None, None]
-        columns, rows = (torch.arange(n, dtype=dtype) + 0.5 for n in (width, height))
+        grid = torch.meshgrid(*(torch.arange(n, dtype=dtype) + 0.5 for n in (width, height)), indexing="xy")
         self.register_buffer("_rays", directions, persistent=False)
         self.register_buffer("_weight", weight / weight.sum(), persistent=False)  # of rows; sums to 1
-        self.register_buffer(
-            "_centers", torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1), persistent=False
-        )
+        self.register_buffer("_centers", torch.stack(grid, -1), persistent=False)
         # The same arithmetic as below, so that an ideal camera moves no pixel by a bit.
         self.register_buffer("_pixels", project(normalize(directions, dim=-1), width, height), persistent=False)
         self._inverse: tuple[Tensor, Tensor] | None = None  # `directions`, and `ideal_pixels` for them

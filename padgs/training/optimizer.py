@@ -139,12 +139,9 @@ class Optimizer:
 
     def refuse_non_finite(self, tensors: Mapping[str, Tensor | None], iteration: int) -> None:
         """Raise a Failure (nan) that names the first tensor that is not finite, and its entry."""
-        bad = first_non_finite(tensors)
-        if bad is not None:
-            every = self._check_every
-            raise Failure(
-                "nan", f"{bad} at iteration {iteration} (all parameters are checked every {every} iterations)"
-            )
+        if (bad := first_non_finite(tensors)) is not None:
+            often = f"all parameters are checked every {self._check_every} iterations"
+            raise Failure("nan", f"{bad} at iteration {iteration} ({often})")
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the moments of Adam by name; not copies."""

@@ -96,9 +96,8 @@ def build(size: Size, seed: int = 0) -> Workload:
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     distance = NEAREST + (FURTHEST - NEAREST) * torch.rand(count, 1, generator=generator)
     reach = (distance * OFFSET * pixel).log().expand(-1, 3)
-    axes = (distance * SIGMA / SHRINKAGE * pixel).log() + LOG_SIGMA_DEVIATION * torch.randn(
-        count, 3, generator=generator
-    )
+    deviations = LOG_SIGMA_DEVIATION * torch.randn(count, 3, generator=generator)
+    axes = (distance * SIGMA / SHRINKAGE * pixel).log() + deviations
     model = PaDGS(direction * distance, torch.cat((reach, axes), dim=-1), voxel_size=0.01, generator=generator)
     views = tuple(_view(f"noise-{number}", size, generator) for number in range(size.views))
     with torch.no_grad():

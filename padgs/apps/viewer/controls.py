@@ -99,9 +99,8 @@ class FilmControls:
         self._may_write, self.keyframes = may_write, list[Tensor]()
         with client.gui.add_folder("film", expand_by_default=False):
             client.gui.add_button("add view").on_click(lambda _: self.change(self.keyframes.append, self._pose()))
-            client.gui.add_button("remove last view").on_click(
-                lambda _: self.change(self.keyframes.pop) if self.keyframes else None
-            )
+            remove = client.gui.add_button("remove last view")
+            remove.on_click(lambda _: self.change(self.keyframes.pop) if self.keyframes else None)
             client.gui.add_button("save film").on_click(lambda _: self.save())
             self.words = client.gui.add_markdown("Add at least two views, then save the film.")
 

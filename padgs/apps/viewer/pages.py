@@ -14,18 +14,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from padgs.apps.viewer import renders
 from padgs.apps.viewer.controls import CropControls, FilmControls
-from padgs.apps.viewer.renders import (
-    CAMERAS,
-    LAYERS,
-    Box,
-    RunRenderer,
-    ViewOptions,
-    captioned,
-    level,
-    side_by_side,
-    with_legend,
-)
+from padgs.apps.viewer.renders import CAMERAS, LAYERS, Box, RunRenderer, ViewOptions
 from padgs.apps.viewer.server import Server
 from padgs.data.camera_paths import gravity
 from padgs.runs.load import LoadedRun
@@ -55,15 +46,15 @@ class PageState:
     def render(self, resolution: float) -> np.ndarray:
         """Render the image at a fraction of its full width and height."""
         width, options = self.width // len(self.renderers), self.options
-        images = [
-            renderer.render(options, self.cam_from_world, width, self.height, resolution) for renderer in self.renderers
-        ]
+        place = (options, self.cam_from_world, width, self.height, resolution)
+        images = [renderer.render(*place) for renderer in self.renderers]
         if options.layer != "colours":
             scale = self.renderers[0].run.scene.scale
-            images = [with_legend(image, options.layer, scale, options.gain) for image in images]
+            images = [renders.with_legend(image, options.layer, scale, options.gain) for image in images]
         if len(images) == 1:
             return images[0]
-        return side_by_side(*(captioned(image, name) for image, name in zip(images, self.names, strict=True)))
+        captioned = (renders.captioned(image, name) for image, name in zip(images, self.names, strict=True))
+        return renders.side_by_side(*captioned)
 
 
 class Page:
@@ -103,9 +94,8 @@ class Page:
         if may_stop and any(renderer.run.result is None for renderer in renderers):
             gui.add_button("stop and score", hint="end training now").on_click(lambda _: self._confirm_stop())
         folder, can_crop = renderers[0].run.folder, all(renderer.can_crop for renderer in renderers)
-        self._up = torch.tensor(
-            gravity(torch.stack([view.cam_from_world for view in scene.train])).up, dtype=torch.float64
-        )
+        poses = torch.stack([view.cam_from_world for view in scene.train])
+        self._up = torch.tensor(gravity(poses).up, dtype=torch.float64)
         model = getattr(renderers[0].run, "file", folder)  # as commands name it
         self._crop = CropControls(client, box, model, can_crop, self.redraw)
         self._film = FilmControls(client, folder, model, scene.origin, lambda: self.state().cam_from_world, may_stop)
@@ -113,9 +103,7 @@ class Page:
         for control in (self._camera, self._layer, self._gain, self._run, self._fov, self._width, self._level):
             control.on_update(self.redraw)
         self._frusta_shown.on_update(self.redraw)
-        self._target.on_update(
-            lambda _: self.go_to(self._views[self._target.value]) if self._target.value in self._views else None
-        )
+        self._target.on_update(lambda _: self.go_to(self._views.get(self._target.value)))
         client.camera.on_update(self.redraw)
         client.camera.near, client.camera.far = 1e-3 * scene.scale, 1e3 * scene.scale
 
@@ -134,8 +122,10 @@ class Page:
         self._changed.set()
         self._thread.join()
 
-    def go_to(self, view: View) -> None:
-        """Move the camera to a view of the scene."""
+    def go_to(self, view: View | None) -> None:
+        """Move the camera to a view of the scene, if there is one."""
+        if view is None:
+            return
         world_from_cam = view.cam_from_world[:3, :3].mT.cpu().numpy()
         with self._client.atomic():
             self._client.camera.position = view.center.cpu().numpy()
@@ -147,9 +137,8 @@ class Page:
             if (value := getattr(self, f"_{name}").value) not in offer:
                 raise ValueError(f"{name} = {str(value)[:40]!r} is not one of the page's choices; choose one of them")
         crop = self._crop.box
-        options = ViewOptions(
-            self._camera.value, self._layer.value, float(self._fov.value), crop, float(self._gain.value)
-        )
+        fov, gain = float(self._fov.value), float(self._gain.value)
+        options = ViewOptions(self._camera.value, self._layer.value, fov, crop, gain)
         camera = self._client.camera
         numbers = np.concatenate((camera.wxyz, camera.position, *(crop or ())))
         if not np.all(np.abs(numbers) < MAX_NUMBER) or not np.linalg.norm(camera.wxyz) > 1 / MAX_NUMBER:  # also NaN
@@ -161,7 +150,7 @@ class Page:
         names = tuple(self._by_name) if self._run.value == BOTH else (self._run.value,)
         cam_from_world = torch.from_numpy(pose)
         if options.camera == "panorama" and self._level.value:
-            cam_from_world = level(cam_from_world, self._up)
+            cam_from_world = renders.level(cam_from_world, self._up)
         renderers = tuple(self._by_name[name] for name in names)
         return PageState(options, cam_from_world, width, height, renderers, names)
 
@@ -272,9 +261,8 @@ def show_runs(server: Server, runs: Sequence[LoadedRun]) -> Iterator[dict[int, P
     Runs in training are shown from their last checkpoint, and followed. Pages can stop training if the server is local,
     and change nothing else. Yields the page of each connected client, by its number.
     """
-    warnings.filterwarnings(
-        "ignore", message=r"Queued .* on a closed connection|\[viser\]"
-    )  # a browser was closed while rendering; or values of a wrong type
+    # A browser was closed while rendering; or values have a wrong type.
+    warnings.filterwarnings("ignore", message=r"Queued .* on a closed connection|\[viser\]")
     renderers, scene, viser = [RunRenderer(run) for run in runs], runs[0].scene, server.viser
     up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
     viser.scene.set_up_direction(up)

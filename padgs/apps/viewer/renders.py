@@ -9,14 +9,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from padgs.data.camera_paths import look_along
-from padgs.evaluation.images import (
-    DEPTH_COLORS,
-    ERROR_COLORS,
-    ERROR_FULL_SCALE,
-    depth_image,
-    error_image,
-    to_uint8,
-)
+from padgs.evaluation.images import DEPTH_COLORS, ERROR_COLORS, ERROR_FULL_SCALE, depth_image, error_image, to_uint8
 from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.geometry.panorama import sample
 from padgs.methods.anchors.method import AnchorModel
@@ -90,19 +83,15 @@ class RunRenderer:
         `width` and `height` are pixels at full resolution; `resolution` is a factor on both, under which low-pass
         filters stay those of the full resolution, or grow.
         """
-        full, lens = (
-            self._lens(options, max(2, round(s * width)), max(2, round(s * height))) for s in (1.0, resolution)
-        )
+        sizes = ((max(2, round(s * width)), max(2, round(s * height))) for s in (1.0, resolution))
+        full, lens = (self._lens(options, *size) for size in sizes)
         view = View("page", cam_from_world, lens.width, lens.height, lens=lens)
         if options.layer == "error":
             image = self._error_from(view, options.gain)
         else:
             rendering = self._method(full, options.crop).render(view)
-            image = (
-                to_uint8(rendering.image)
-                if options.layer == "colours"
-                else depth_image(rendering, self.run.scene.scale)
-            )
+            is_depth, scale = options.layer == "depth", self.run.scene.scale
+            image = depth_image(rendering, scale) if is_depth else to_uint8(rendering.image)
         return image if isinstance(lens, Pinhole) else _pad_to(image, max(2, round(resolution * height)))
 
     def nearest(self, cam_from_world: Tensor) -> View:

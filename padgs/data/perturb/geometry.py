@@ -113,9 +113,8 @@ def random_points(scene: Scene, shape: str, random: np.random.Generator) -> Scen
         if "shell" in shape:
             distance[: count // 10] = FAR * radius
         points = center + distance[:, None] * _directions(count, random)
-    return replace(
-        scene, points=torch.from_numpy(points).to(scene.points), point_colors=torch.full_like(scene.point_colors, GRAY)
-    )
+    gray = torch.full_like(scene.point_colors, GRAY)
+    return replace(scene, points=torch.from_numpy(points).to(scene.points), point_colors=gray)
 
 
 @condition("{:.0%} of the points are anywhere in a box 10 times as large", 0.01, 0.05, 0.2, allowed=(0.2, 0.5, 1.0))

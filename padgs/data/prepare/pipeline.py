@@ -80,17 +80,13 @@ def prepare(
     try:
         work.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
-        # Another process may have finished in the meantime.
-        return (
-            _existing(source, destination, options)
-            or _Job(source, destination.absolute(), work, options, progress).run()
-        )
+        if result := _existing(source, destination, options):  # of another process, in the meantime
+            return result
+        return _Job(source, destination.absolute(), work, options, progress).run()
     except Timeout as error:
         raise DataError(f"another process prepares {destination}; wait for it, or choose another path") from error
     except OSError as error:
-        raise DataError(
-            f"cannot prepare {destination} ({error.strerror or error}); the same command resumes"
-        ) from error
+        raise DataError(f"cannot prepare {destination} ({error.strerror or error}); repeat the command") from error
     except MemoryError as error:
         raise DataError(
             f"cannot prepare {destination} (out of memory); the same command with --threads 1 uses less, and resumes"
@@ -142,9 +138,8 @@ class _Job:
         self.folder.open("images", digest_of(self.source.fingerprint, options, _LATE), keep=kept)
         self.input = given or digest_of(self.source.fingerprint, options)
         # Short names, because pycolmap's list of pairs does not support spaces.
-        self.files = {
-            f"{index:06d}{_suffix(image)}": name for index, (name, image) in enumerate(self.source.images.items())
-        }
+        numbered = enumerate(self.source.images.items())
+        self.files = {f"{index:06d}{_suffix(image)}": name for index, (name, image) in numbered}
         self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
         self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
         self.database = self.work / "database.db"
@@ -246,16 +241,13 @@ class _Job:
         registered = tuple(frame.name for frame in frames)
         unregistered = tuple(name for name in self.files.values() if name not in set(registered))
         if unregistered:
-            notes.append(
-                f"{len(unregistered)} of {len(self.files)} panoramas have no pose: {listed(unregistered)}; {_REMEDIES}"
-            )
+            lost = f"{len(unregistered)} of {len(self.files)} panoramas"
+            notes.append(f"{lost} have no pose: {listed(unregistered)}; {_REMEDIES}")
         if others:
             sizes = listed(part.num_reg_frames() for part in others)
             notes.append(f"{len(others)} smaller part(s) of {sizes} panoramas are not connected to the largest")
-        seconds = self.folder.seconds
-        result = Prepared(
-            self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), seconds, tuple(notes)
-        )
+        sizes = (len(cloud.points), len(tracks.frame))
+        result = Prepared(self.destination, registered, unregistered, *sizes, self.folder.seconds, tuple(notes))
         for frame in frames:
             target = partial_folder / "images" / frame.name
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -12,18 +12,11 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from padgs.data import images as image_files
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, DataError, Frame, listed
 from padgs.data.check import OVERLAY
-from padgs.data.images import (
-    EXTENSIONS,
-    ImageFile,
-    decode,
-    inspect,
-    notes_on,
-    refuse_dual_fisheye,
-    refuse_other_shapes,
-)
+from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
 
@@ -76,7 +69,7 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
                 start = time if start is None else start
                 pixels = _pixels(frame, video)
                 if index == 0:  # before an hour of decoding
-                    refuse_other_shapes(pixels.shape[1], pixels.shape[0], video)
+                    image_files.refuse_other_shapes(pixels.shape[1], pixels.shape[0], video)
                     refuse_dual_fisheye(pixels, video)
                 progress(index + 1, max(total, index + 1))
                 now = int((time - start) * per_second + 1e-6)
@@ -99,9 +92,8 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
 def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
     """Return the pixels of a frame; a DataError if they are not one upright panorama, or in colours of HDR."""
     if getattr(frame, "color_trc", None) in _HDR_TRANSFER:
-        raise DataError(
-            f"{video} is HDR (transfer {_HDR_TRANSFER[frame.color_trc]}); export it in standard dynamic range"
-        )
+        transfer = _HDR_TRANSFER[frame.color_trc]
+        raise DataError(f"{video} is HDR (transfer {transfer}); export it in standard dynamic range")
     for side in frame.side_data:
         if side.type.name in _ONE_PANORAMA:
             numbers, otherwise = _ONE_PANORAMA[side.type.name]
@@ -117,9 +109,8 @@ def sharpness(frame: NDArray[np.uint8]) -> float:
     0.0
     """
     gray = frame[::2, ::2, 1].astype(np.int16)
-    return float(
-        np.abs(4 * gray[1:-1, 1:-1] - gray[:-2, 1:-1] - gray[2:, 1:-1] - gray[1:-1, :-2] - gray[1:-1, 2:]).mean()
-    )
+    around = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:]
+    return float(np.abs(4 * gray[1:-1, 1:-1] - around).mean())
 
 
 UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # raw files of 360-degree cameras
@@ -159,9 +150,7 @@ def find_source(path: Path, mask: str) -> Source:
     others, ways_out = _others(folder)
     if len(names) < 2:
         besides = f" (left out: {others})" if others else ""
-        raise DataError(
-            f"{folder} holds {len(names)} images{besides}; structure from motion needs at least two{ways_out}"
-        )
+        raise DataError(f"{folder} holds {len(names)} images{besides}; at least two are needed{ways_out}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
     for name in names[:: -(-len(names) // DECODED)]:
@@ -171,7 +160,7 @@ def find_source(path: Path, mask: str) -> Source:
     capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, mask_notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
-    notes = [*notes_on(list(images.values())), *mask_notes]
+    notes = [*image_files.notes_on(list(images.values())), *mask_notes]
     if others:
         notes.append(f"left out: {others}{ways_out}")
     expected = mask_folder(path)

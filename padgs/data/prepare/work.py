@@ -49,9 +49,8 @@ def free_memory() -> int | None:
 def refuse_full(folder: Path) -> None:
     """Refuse by an OSError to work on a nearly full disk, where pycolmap's threads would kill the process silently."""
     if shutil.disk_usage(folder).free < MIN_FREE_DISK:
-        raise OSError(
-            errno.ENOSPC, f"less than {MIN_FREE_DISK >> 20} MiB is left on its disk: free some space", str(folder)
-        )
+        reason = f"less than {MIN_FREE_DISK >> 20} MiB is left on its disk: free some space"
+        raise OSError(errno.ENOSPC, reason, str(folder))
 
 
 def link_or_copy(file: Path, target: Path) -> None:

@@ -109,9 +109,8 @@ class SyntheticOptions:
         words = ["synthetic", self.scene]
         if self.path_radius is not None:
             words.append("other-path")
-        words += [
-            f"{name}-{length:g}m" for name in ("nearest", "horizon") if (length := getattr(self, name)) is not None
-        ]
+        lengths = {"nearest": self.nearest, "horizon": self.horizon}
+        words += [f"{name}-{length:g}m" for name, length in lengths.items() if length is not None]
         if self.rooms is not None:
             words.append(f"of-{self.rooms}")
         if self.pose_noise_translation or self.pose_noise_rotation:

@@ -141,9 +141,8 @@ def room_chain(options: SyntheticOptions, path: Array, rng: np.random.Generator)
     shapes: list[Shape] = [Room((-half, -WIDTH / 2, 0.0), (half, WIDTH / 2, HEIGHT), skins)]
     for k, x in enumerate(centers):
         paper = fu.matt(build(["detailed", described["papers"][k % 5]]))
-        shapes += [
-            Box((x, side * WIDTH / 2, HEIGHT / 2), (ROOM_LENGTH / 2, 0.01, HEIGHT / 2), paper) for side in (-1, 1)
-        ]
+        half_wall = (ROOM_LENGTH / 2, 0.01, HEIGHT / 2)
+        shapes += [Box((x, side * WIDTH / 2, HEIGHT / 2), half_wall, paper) for side in (-1, 1)]
         furniture = described["furniture"][k % 3]
         shapes += Builder(options, rng, x).shapes([["pendant", 0.0, 0.0, HEIGHT, 0.45], *furniture])
         if k:
@@ -170,9 +169,8 @@ def sky(direction: Array) -> Array:
     color = tx.mix((0.86, 0.9, 0.94), (0.3, 0.52, 0.85), np.sqrt(up))
     reach = 1 / (up + 0.12)
     cloud = tx.noise(direction[0] * reach, direction[1] * reach, 5.0)
-    return tx.mix(color, (0.98, 0.98, 0.97), np.clip(2.6 * cloud - 1.15, 0, 1) * np.clip(6 * up, 0, 1)).astype(
-        np.float32
-    )
+    share = np.clip(2.6 * cloud - 1.15, 0, 1) * np.clip(6 * up, 0, 1)
+    return tx.mix(color, (0.98, 0.98, 0.97), share).astype(np.float32)
 
 
 def _meadow(build: Builder) -> Texture:

@@ -185,9 +185,8 @@ def books(uv: Array, spines: Sequence[Color], board: Color, shelf: float = 0.32)
     top = 0.2 + 0.09 * random_of(level, book, 1)
     color = palette[(random_of(level, book, 2) * len(palette)).astype(np.int64)].T
     label = (np.abs(up - 0.6 * top) < 0.02) & (random_of(level, book, 4) > 0.4)
-    color = mix(color, (0.9, 0.85, 0.7), np.float32(0.8) * label) * (
-        0.65 + 0.35 * np.sin(np.pi * np.clip(across, 0, 1))
-    )
+    round_back = 0.65 + 0.35 * np.sin(np.pi * np.clip(across, 0, 1))
+    color = mix(color, (0.9, 0.85, 0.7), np.float32(0.8) * label) * round_back
     color = np.where(up > top, np.float32(0.06), color)
     wood = np.asarray(board, np.float32)[:, None] * (0.8 + 0.4 * noise(uv[0] * 0.2, uv[1], 0.4))
     return np.where(up < 0.03, wood, color)

@@ -214,9 +214,8 @@ def cell_keys(cells: Tensor) -> Tensor:
 def unique_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distinct rows [U, 3] of cells [N, 3] in lexicographic order, and the index of each input, [N]."""
     keys, inverse = torch.unique(cell_keys(cells), return_inverse=True)
-    first = torch.full_like(keys, len(cells)).scatter_reduce(
-        0, inverse, torch.arange(len(cells), device=cells.device), "amin"
-    )
+    numbers = torch.arange(len(cells), device=cells.device)
+    first = torch.full_like(keys, len(cells)).scatter_reduce(0, inverse, numbers, "amin")
     return cells[first], inverse
 
 

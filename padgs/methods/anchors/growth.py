@@ -212,9 +212,8 @@ def find_new_anchors(
     if not found:
         nothing = anchors[:0]
         return NewAnchors(nothing, model.features.detach()[:0], mean_gradient[:0], mean_gradient[:0])
-    return NewAnchors(
-        *(torch.cat([getattr(new_anchors, name) for new_anchors in found]) for name in NewAnchors.__annotations__)
-    )
+    columns = zip(*(vars(new_anchors).values() for new_anchors in found), strict=True)
+    return NewAnchors(*map(torch.cat, columns))
 
 
 def _largest_per_cell(values: Tensor, cell: Tensor, count: int) -> Tensor:

@@ -116,10 +116,8 @@ class AnchorModel:
             rendering, offsets = self._rendered(decoded, view)
         count = decoded.count()
         self._capacity = max(int(HEADROOM * count) + 1, self._capacity * 15 // 16)
-        drawn = replace(rendering, visible=rendering.visible[:count])
-        return AnchorRender(
-            drawn, offsets, decoded.gaussians.first(count), decoded.slots[:count], decoded.raw_opacities
-        )
+        drawn, gaussians = replace(rendering, visible=rendering.visible[:count]), decoded.gaussians.first(count)
+        return AnchorRender(drawn, offsets, gaussians, decoded.slots[:count], decoded.raw_opacities)
 
     def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:
         offsets = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
@@ -167,11 +165,9 @@ class AnchorModel:
 
     def state(self) -> State:
         """Return parameters, growth statistics and random state; not copies."""
-        growth = {f"growth/{name}": values for name, values in self.growth.statistics.items()}
-        values = {name: getattr(self.anchors, name) for name in LENGTHS}
-        return State(
-            {**self.anchors.state_dict(), **growth, "random/growth": self.growth.generator.get_state()}, values
-        )
+        tensors = {f"growth/{name}": values for name, values in self.growth.statistics.items()}
+        tensors["random/growth"] = self.growth.generator.get_state()
+        return State(self.anchors.state_dict() | tensors, {name: getattr(self.anchors, name) for name in LENGTHS})
 
     def load_state(self, state: State) -> None:
         """Restore the model that `state` was taken of, whatever its number of anchors."""

@@ -97,18 +97,14 @@ class EgoNeRFOptions:
         sizes = ("density_components", "appearance_components", "features", "hidden", "environment_height", "rays")
         check(self, "at least 1", lambda size: size >= 1, *sizes)
         if self.coarse_samples < 4 or self.fine_samples < 1:
-            raise ValueError(
-                f"coarse_samples is {self.coarse_samples} and fine_samples {self.fine_samples}; "
-                "they must be at least 4 and 1"
-            )
+            given = f"coarse_samples is {self.coarse_samples} and fine_samples {self.fine_samples}"
+            raise ValueError(f"{given}; they must be at least 4 and 1")
         check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
         for surroundings in PUBLISHED if self.surroundings == "auto" else (self.surroundings,):
             _check_constants(self.constants(surroundings))
         check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
         if self.samples_at_once < self.samples:
-            raise ValueError(
-                f"samples_at_once is {self.samples_at_once}, less than the {self.samples} of a single ray; raise it"
-            )
+            raise ValueError(f"samples_at_once is {self.samples_at_once}, and a ray has {self.samples}; raise it")
 
     def constants(self, surroundings: str) -> Constants:
         """Return the constants for indoor or outdoor; given values replace published ones."""
@@ -273,9 +269,8 @@ class Shader(nn.Module):
         width = (features + 3) * (1 + 2 * FREQUENCIES)
         last = nn.Linear(hidden, 3)
         nn.init.zeros_(last.bias)
-        self.network = nn.Sequential(
-            nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last, nn.Sigmoid()
-        )
+        layers = (nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.network = nn.Sequential(*layers, last, nn.Sigmoid())
 
     def forward(self, products: Sequence[Tensor], chart: Tensor, directions: Tensor) -> Tensor:
         """Return colours [N, 3] from `grids.products`, charts [N] of the positions, and unit directions [N, 3]."""

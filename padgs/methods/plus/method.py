@@ -117,9 +117,8 @@ class PlusOptions(SplatOptions):
         iterations to fit, and each makes every later iteration slower.
         """
         every = iterations_per_round(iterations)
-        plain = DensificationOptions(
-            **{field.name: getattr(self, field.name) for field in fields(DensificationOptions)}
-        )
+        names = (field.name for field in fields(DensificationOptions))
+        plain = DensificationOptions(**{name: getattr(self, name) for name in names})
         threshold = self.gradient_threshold * max(1.0, math.sqrt(LONG_RUN / iterations))
         schedule = {"densify_from": 0, "densify_until": ROUNDS * every + 1, "densify_every": every}
         return replace(plain, gradient_threshold=threshold, reset_every=iterations + 1, **schedule)

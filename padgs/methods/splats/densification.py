@@ -249,9 +249,8 @@ class Densifier:
     def _decay_opacities(self, optimizer: torch.optim.Adam) -> None:
         if self.options.opacity_decay > 0:
             logits = self.splats.opacity_logits
-            logits.copy_(
-                torch.logit((torch.sigmoid(logits) - self.options.opacity_decay).clamp(min=MIN_DECAYED_OPACITY))
-            )
+            opacities = torch.sigmoid(logits) - self.options.opacity_decay
+            logits.copy_(torch.logit(opacities.clamp(min=MIN_DECAYED_OPACITY)))
             forget_moments(logits, optimizer)
 
     def _reset_opacities(self, optimizer: torch.optim.Adam) -> None:

@@ -44,9 +44,8 @@ def smoothed_for_view(gaussians: Gaussians, view: View, pixels: Tensor, variance
     `RESOLVED_PIXEL` of the finest training pixel. Opacity falls as the volume grows.
     """
     own = (gaussians.means - view.center.to(gaussians.means)).norm(dim=-1) / view.camera.focal
-    wide, share = widened_scales(
-        gaussians.scales, variance * ((RESOLVED_PIXEL * pixels).square() - own * own).clamp(min=0)
-    )
+    missing = ((RESOLVED_PIXEL * pixels).square() - own * own).clamp(min=0)
+    wide, share = widened_scales(gaussians.scales, variance * missing)
     return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
 
 

@@ -28,22 +28,14 @@ class Strip:
         self._row_start = torch.cat((torch.zeros(1, dtype=torch.int64), per_row.cumsum(0)))
         self._level = projected.level
         self.tiles = int(self._row_start[-1])
-        self.grid = abi.TileGrid(
-            camera.width, camera.height, first_row, end_row, pointer(self._level), pointer(self._row_start)
-        )
+        lists = map(pointer, (self._level, self._row_start))
+        self.grid = abi.TileGrid(camera.width, camera.height, first_row, end_row, *lists)
         self.slot_start = torch.empty(count + 1, dtype=torch.int64)
         self.tile_start = torch.empty(self.tiles + 1, dtype=torch.int64)
         self.instances = torch.empty(int(projected.per_row[first_row:end_row].sum()), 3, dtype=torch.int32)
-        cpu.library().padgs_bin(
-            pointer(projected.boxes),
-            count,
-            pointer(projected.order),
-            projected.visible,
-            ctypes.byref(self.grid),
-            pointer(self.slot_start),
-            pointer(self.tile_start),
-            pointer(self.instances),
-        )
+        gaussians = (pointer(projected.boxes), count, pointer(projected.order), projected.visible)
+        outputs = map(pointer, (self.slot_start, self.tile_start, self.instances))
+        cpu.library().padgs_bin(*gaussians, ctypes.byref(self.grid), *outputs)
 
 
 class Projected(native.Strips[Strip]):
@@ -61,9 +53,8 @@ class Projected(native.Strips[Strip]):
         self.boxes = torch.empty(count, 5, dtype=torch.int32)
         library.padgs_project(ctypes.byref(camera), ctypes.byref(inputs), pointer(self.footprints), pointer(self.boxes))
         self.order = torch.empty(count, dtype=torch.int32)
-        self.visible = library.padgs_depth_order(
-            pointer(self.footprints), pointer(self.boxes), count, pointer(self.order)
-        )
+        footprints, boxes = pointer(self.footprints), pointer(self.boxes)
+        self.visible = library.padgs_depth_order(footprints, boxes, count, pointer(self.order))
         self.level = torch.empty(rows, dtype=torch.int32)
         library.padgs_tile_levels(ctypes.byref(camera), pointer(self.level))
         self.per_row = torch.empty(rows, dtype=torch.int64)

@@ -15,16 +15,8 @@ from torch import Tensor
 from padgs.native import cuda
 from padgs.native.abi import GRADIENT_SUMS, REMOVAL, Gradients, Inputs, NativeCamera, pointer
 from padgs.native.cuda import HostCopy, Queue, SortArguments, TileTable
-from padgs.render.backends.native import (
-    TILE,
-    NativeImage,
-    Pixels,
-    Strips,
-    Upstream,
-    native_camera,
-    native_rays,
-    strip_cuts,
-)
+from padgs.render.backends import native
+from padgs.render.backends.native import TILE, NativeImage, Pixels, Strips, Upstream
 from padgs.render.contract import LazyCounters, Removals, RenderOptions
 
 IDENTITY = torch.eye(4)
@@ -61,12 +53,9 @@ class DeviceStrip:
             sort.values.zero_()
         arguments = cuda.BinArguments(
             self.table,
-            pointer(projected.boxes),
-            pointer(projected.order),
+            *map(pointer, (projected.boxes, projected.order)),
             projected.visible,
-            pointer(counts),
-            pointer(self.slot_start),
-            pointer(self.reaches),
+            *map(pointer, (counts, self.slot_start, self.reaches)),
             sort.arguments(self.slots, bits=largest.bit_length()),
             pointer(self.tile_start),
         )
@@ -116,17 +105,15 @@ class DeviceProjected(Strips[DeviceStrip]):
         sort = Sorter(self.queue, count, device)
         self.counts = torch.zeros(rows + 1, dtype=torch.int64, device=device)
         outputs = (self.footprints, self.boxes, sort.keys, sort.values)
-        table = self.table(0, rows)
-        arguments = cuda.ProjectArguments(
-            camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(self.counts)
-        )
+        lists = (*map(pointer, outputs), self.table(0, rows), pointer(self.counts))
+        arguments = cuda.ProjectArguments(camera, pointer(pose), inputs, *lists)
         cuda.call("padgs_cuda_project", self.queue, arguments)
         cuda.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
         self.capacity, self.visible = capacity, count
         cuts = [0, rows]
         if not capacity:
             *self.per_row, self.visible = self.counts.tolist()
-            cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+            cuts = native.strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
         super().__init__(DeviceStrip, cuts)
 
     def fits(self, counts: list[int]) -> bool:
@@ -175,18 +162,18 @@ class _Image(NativeImage):
 
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
-        self.rays = native_rays(camera, device)
+        self.rays = native.native_rays(camera, device)
         size = (camera.height, camera.width)
         transmittance, depth = FLOATS(2, *size, device=device)
         pixels = (FLOATS(*size, 3, device=device), transmittance, depth)
         self._kept = _Kept.allocate(options, size, device, differentiated=differentiated)
-        native, key = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
+        seen, key = native.native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
         limit = min(options.max_instances, MAX_INSTANCES)
         capacity = _capacities.get(key, 0)
         if not 0 < capacity <= limit:
             capacity = 0
         while True:
-            self._projected = DeviceProjected(native, pose, inputs, options.max_instances, capacity=capacity)
+            self._projected = DeviceProjected(seen, pose, inputs, options.max_instances, capacity=capacity)
             counts = HostCopy(self._projected.counts) if capacity else None
             pairs = self._blend(background, pixels)
             if counts is None or self._projected.fits(counts.values()):

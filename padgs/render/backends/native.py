@@ -210,9 +210,8 @@ def strip_cuts(per_row: list[int], max_instances: int) -> list[int]:
 def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> NativeCamera:
     """Return pose, camera and options in one structure; ValueError for an unknown projection."""
     if options.projection not in PROJECTIONS:
-        raise ValueError(
-            f"the native libraries do not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
-        )
+        known = ", ".join(PROJECTIONS)
+        raise ValueError(f"the native libraries do not know projection {options.projection!r}; known: {known}")
     low_pass, off_panorama = low_pass_of(options, camera), -1.0
     if isinstance(camera, RayTable):
         off_panorama = _of_table(_off_panorama, camera.table, camera.table.device)
