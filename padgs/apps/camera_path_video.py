@@ -180,9 +180,8 @@ def _folder(path: Path, description: str) -> Iterator[WriteFrame]:
 @contextmanager
 def _mp4(path: Path, view: View, fps: float, spherical: bool) -> Iterator[WriteFrame]:
     if view.width % 2 or view.height % 2:
-        raise ValueError(
-            f"frames are {view.width}x{view.height}; H.264 needs even sides: change them, or give a folder"
-        )
+        size = f"{view.width}x{view.height}"
+        raise ValueError(f"frames are {size}; H.264 supports even sides only: choose even sides, or a folder")
     try:
         import av
     except ImportError as error:

@@ -106,10 +106,8 @@ def check(
     report.median_depth = median_depth(poses, scene.points)
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     if hidden := [f"{name} ({share:.1%})" for name, share in report.masked.items() if share > MAX_HIDDEN]:
-        text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; in a "
-        text += (
-            "mask 255 means use, 0 means ignore: repair them, or set --mask (data.mask) to none, inverted or a folder"
-        )
+        text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "
+        text += "255 means use, 0 means ignore: repair them, or set data.mask (--mask) to none, inverted or a folder"
         (report.problems if options.mask == "auto" else report.notes).append(text)
     _check_leaks(scene, capture, report)
     if report.path_length == 0 and len(poses) > 1:
@@ -188,7 +186,8 @@ def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
     for view in scene.test:
         twin = digests.get(inspect(files[view.name]).digest)
         if twin is not None:
-            report.problems.append(f"the test view {view.name} is the same image as {twin} in training; remove one")
+            both = f"the test view {view.name} is the same image as the training view {twin}"
+            report.problems.append(f"{both}; remove one of them")
     if not scene.test:
         return
     train, test = (centers(torch.stack([view.cam_from_world for view in views])) for views in (scene.train, scene.test))

@@ -134,9 +134,8 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
         notes = (f"points: {RANDOM_POINTS} random points around the cameras ({why})",)
     points, colors = cloud.points, cloud.colors
     if not len(points):
-        raise DataError(
-            f"{where} holds no points, from which training starts; set data.points to a PLY file, or random"
-        )
+        why = "training starts from a point cloud"
+        raise DataError(f"{where} holds no points; {why}: set data.points to a PLY file, or to random")
     bad = (~points.float().isfinite().all(1)).sum().item()
     if bad:
         raise DataError(f"{bad} of {len(points)} points of {where} are not finite; remove them from the cloud")

@@ -129,9 +129,8 @@ def read_depth(file: Path) -> NDArray[np.float32]:
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
-        raise DataError(
-            f"{file} is {values.dtype} {list(values.shape)}; it must be an array [height, width] of numbers"
-        )
+        kind = f"{values.dtype} {list(values.shape)}"
+        raise DataError(f"{file} is an array of {kind}; it must be [height, width] numbers")
     return values.astype(np.float32)
 
 

@@ -87,9 +87,7 @@ def find_masks(
     rule = _ROWS.fullmatch(spec)
     files, note = ({}, None) if spec == "none" else _mask_files(capture, mask_path(spec, capture.folder))
     if inverted and not files:
-        raise DataError(
-            f"data.mask={given}: no mask files are there to invert; put them into {capture.folder / 'masks'}"
-        )
+        raise DataError(f"data.mask={given}: there are no mask files to invert; put some in {capture.folder / 'masks'}")
     notes = [note] if note else []
     rows: dict[int, Tensor] = {}  # by height
     if rule:
@@ -167,7 +165,7 @@ def _refuse_hidden(weights: Tensor, message: str) -> float:
 def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], str | None]:
     """Map frame names to mask files (one for all, a folder of files, or files that the format names); and a note."""
     if given is not None and not given.exists():
-        raise DataError(f"data.mask={given}: there is no such file; keywords: auto, none, inverted, rows:959/1024")
+        raise DataError(f"data.mask={given}: no such file or folder; keywords: auto, none, inverted, rows:959/1024")
     named = {frame.name: frame.mask for frame in capture.frames if frame.mask is not None}
     if given is None and named:
         absent = [path for path in named.values() if not path.is_file()]

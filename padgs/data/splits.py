@@ -52,7 +52,7 @@ def split_frames(
         origin = " and ".join(LISTS[side] for side in lists)
     if not lists:
         if mode == "files":
-            raise DataError(f"data.split=files, but {folder} has no train.txt and test.txt; write them or use every")
+            raise DataError(f"data.split=files, but {folder} holds no train.txt, no test.txt; write them or use every")
         return _every(names, every, mode)
     chosen = {side: _resolve(lines, names, f"{side} list", unposed) for side, lines in lists.items()}
     notes = [f"split: {origin}"]
@@ -146,5 +146,6 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
         without = [line for line in absent if known & set(spellings(line))]
         if without:
             raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
-        raise DataError(f"the {which} names images that do not exist: {listed(absent)}; there are {listed(names)}")
+        known = f"the data set has {listed(names)}"
+        raise DataError(f"the {which} names images that do not exist: {listed(absent)}; {known}")
     return chosen

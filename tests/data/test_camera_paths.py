@@ -89,7 +89,7 @@ def test_the_camera_path_has_constant_speed_and_rounds_corners():
     assert torch.allclose(steps[15:25], steps[20].expand(10), rtol=0.05), "however far apart the cameras"
     corner = (found - torch.tensor([4.0, 0, 0], dtype=torch.float64)).norm(dim=-1).min()
     assert 0.05 < corner < 1.0
-    with pytest.raises(ValueError, match="use --path orbit or --path dolly"):
+    with pytest.raises(ValueError, match="use --path orbit or dolly"):
         along_cameras(walk([[1, 0, 0]] * 3), 5)
     assert PATHS["dolly"](walk([[1, 0, 0]] * 3), 5).isfinite().all()
 

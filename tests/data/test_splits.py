@@ -83,7 +83,7 @@ def test_ambiguous_names(tmp_path: Path) -> None:
 def test_too_few_views_and_no_lists(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot be split; at least 2"):
         split_frames(["a.jpg"], tmp_path)
-    with pytest.raises(DataError, match="holds neither train.txt nor test.txt"):
+    with pytest.raises(DataError, match="holds no train.txt, no test.txt"):
         split_frames(NAMES, tmp_path, mode="files")
 
 

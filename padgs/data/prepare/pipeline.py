@@ -86,7 +86,8 @@ def prepare(
     except Timeout as error:
         raise DataError(f"another process prepares {destination}; wait for it, or choose another path") from error
     except OSError as error:
-        raise DataError(f"cannot prepare {destination} ({error.strerror or error}); repeat the command") from error
+        why = error.strerror or error
+        raise DataError(f"cannot prepare {destination} ({why}); the same command resumes") from error
     except MemoryError as error:
         raise DataError(
             f"cannot prepare {destination} (out of memory); the same command with --threads 1 uses less, and resumes"

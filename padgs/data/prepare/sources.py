@@ -150,7 +150,8 @@ def find_source(path: Path, mask: str) -> Source:
     others, ways_out = _others(folder)
     if len(names) < 2:
         besides = f" (left out: {others})" if others else ""
-        raise DataError(f"{folder} holds {len(names)} images{besides}; at least two are needed{ways_out}")
+        found = f"{folder} holds {len(names)} images{besides}"
+        raise DataError(f"{found}; structure from motion needs at least two{ways_out}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
     for name in names[:: -(-len(names) // DECODED)]:
