@@ -64,10 +64,7 @@ def threads(count: int) -> Iterator[None]:
 def measure(
     work: Callable[[], object], *, repeats: int = 10, warm_up: int = 2, device: Device = "cpu"
 ) -> dict[str, Any]:
-    """Time `work()` several times, after some untimed calls.
-
-    Returns {"repeats": n, "wall": {"median", "p95", "min"}, "cpu": {the same}} in seconds.
-    """
+    """Time `work()` several times: {"repeats": n, "wall": {"median", "p95", "min"}, "cpu": {the same}} in seconds."""
     for _ in range(warm_up):
         work()
     laps = []

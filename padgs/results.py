@@ -256,10 +256,7 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
 
 
 def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
-    """Return run folder -> result for all run folders in a folder, sorted by name, and the errors of unreadable ones.
-
-    A folder that was renamed has another name than its run.
-    """
+    """Return run folder -> result for all run folders in a folder, by name, and the errors of unreadable ones."""
     results: dict[Path, Result] = {}
     errors: list[ResultError] = []
     for path in sorted(folder.glob(f"*/{FILE_NAME}")):

@@ -195,9 +195,9 @@ def _axis_rotations() -> Sequence[np.ndarray]:
 def _closest_points(
     points: Tensor, means: Tensor, start: Similarity, count: int, iterations: int
 ) -> tuple[float, Similarity]:
-    """Align means to points by iterative closest points; also return their median distance.
+    """Align means to points by iterative closest points, from medians and spreads if `start` has scale 0.
 
-    A start with scale 0 is a rotation: scale and place then make medians and spreads equal.
+    Also return the median distance.
     """
     from scipy.spatial import KDTree
 

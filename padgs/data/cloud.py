@@ -146,10 +146,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
 
 
 def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
-    """Draw random points around cameras [F, 4, 4], uniform in direction and in the logarithm of the distance.
-
-    Deterministic, and equivariant to the scale of the cameras.
-    """
+    """Draw random points around cameras [F, 4, 4], uniform in direction and log distance; always the same ones."""
     positions = centers(cam_from_world)
     middle = positions.mean(0)
     spread = (positions - middle).norm(dim=1).max().clamp(min=1e-9)

@@ -72,10 +72,7 @@ def reprojection_errors(poses: Tensor, points: Tensor, tracks: Tracks, width: in
 
 
 def best_reading(capture: Capture) -> Capture:
-    """Decide between the readings of a capture by the colours of points and panoramas; the first, if they cannot tell.
-
-    Notes say what was decided, and why.
-    """
+    """Choose between the readings of a capture by the colours of points and panoramas, else the first; add a note."""
     readings = [
         reading
         for i, reading in enumerate(capture.readings)

@@ -127,10 +127,7 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
 
 
 def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:
-    """Return the conversion to sRGB of RGB pixels by profile, gamma and colour space; None if they are sRGB.
-
-    Colours that are described in an unsupported way are a DataError.
-    """
+    """Return the conversion of RGB pixels to sRGB by profile, gamma and colour space; None if they are sRGB."""
     header = data[: data.find(b"IDAT")] if image.format == "PNG" else b""
     if (place := header.find(b"cICP")) >= 0 and header[place + 4 : place + 8] != bytes((1, 13, 0, 1)):
         raise DataError(f"{path} has colours of video or HDR (cICP {[*header[place + 4 : place + 8]]}); {_TO_SRGB}")

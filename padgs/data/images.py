@@ -122,10 +122,7 @@ def refuse_other_shapes(width: int, height: int, path: Path) -> None:
 
 
 def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
-    """Decode an image file to uint8 pixels, [H, W, 3] for RGB in sRGB, and [H, W, 1] for L.
-
-    A DataError says that the file is truncated, damaged, or partly transparent.
-    """
+    """Decode an image to uint8 pixels, [H, W, 3] in sRGB for RGB, [H, W, 1] for L; a DataError if it is damaged."""
     return _decode(read_bytes(path), path, mode)
 
 

@@ -93,10 +93,7 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
 
 
 def perspective_scene(scene: Scene, rotations: Tensor, lens: Callable[[Panorama], Pinhole]) -> Scene:
-    """Replace each training panorama by perspective views; test views remain panoramas.
-
-    Views that are fully masked are dropped (tested on a grid of at most 64 x 64 directions).
-    """
+    """Replace each training panorama by perspective views that are not fully masked; test views remain panoramas."""
     views: list[View] = []
     for panorama in scene.train:
         cut = perspective_views(panorama, rotations, lens(Panorama(panorama.width, panorama.height)))

@@ -76,10 +76,7 @@ def score(
 
 
 def cropped_mask(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tensor | None:
-    """Return the mask [H, W] with the rows below the protocol's crop set to 0; None if nothing is masked.
-
-    They are masked, not cut off, because latitude refers to the whole image.
-    """
+    """Return the mask [H, W] with 0 below the protocol's crop, as latitude refers to the whole image; None: no mask."""
     rows = protocol.rows(image.shape[0])
     if rows == image.shape[0]:
         return mask

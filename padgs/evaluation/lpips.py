@@ -120,10 +120,7 @@ class LPIPS(nn.Module):
         return [torch.cat(tap, dim=2) for tap in zip(*bands, strict=True)]
 
     def _taps(self, a: Tensor, b: Tensor) -> Iterator[Tensor]:
-        """Yield the distance at each tap for two network inputs [1, 3, H, W].
-
-        Both images pass each layer together, so that only one layer of features is in memory.
-        """
+        """Yield the distance of two network inputs [1, 3, H, W] at each tap; one layer of features is in memory."""
         for index in range(len(self.network.layers)):
             a, b = self._layer(a, index), self._layer(b, index)
             if index in self.network.taps:

@@ -41,10 +41,7 @@ def ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
 
 
 def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return `ws_psnr` after fitting a gain and an offset of each channel to the target.
-
-    The remaining error is not due to exposure or white balance of the whole image.
-    """
+    """Return `ws_psnr` after fitting gain and offset of each channel to the target: the error besides exposure."""
     weight = sphere_weight(image, mask)[..., None]
     weight = weight / weight.sum()
     means = [(of * weight).sum((0, 1)) for of in (image, target)]
@@ -60,20 +57,14 @@ def band_ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None, *, b
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the mean SSIM of the flat image: 11 x 11 Gaussian window, zero padding (as in the 3DGS code).
-
-    With a mask, the weight of a window is the smallest mask value in it.
-    """
+    """Return the mean SSIM of the flat image (as the 3DGS code); a window counts as its smallest mask value."""
     padded = None if mask is None else torch.nn.functional.pad(mask, (WINDOW_RADIUS,) * 4, value=1.0)
     weight = _ones(image) if padded is None else _whole_windows(padded)
     return weighted_mean(ssim_map(image, target), weight)
 
 
 def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return WS-SSIM (Zhou et al. 2018): SSIM by solid angle, whose windows continue across the seam and the poles.
-
-    It does not depend on the position of the seam.
-    """
+    """Return WS-SSIM (Zhou et al. 2018): SSIM by solid angle, with windows that continue across seam and poles."""
     r = WINDOW_RADIUS
     padded = ssim_map(pad_panorama(image, r), pad_panorama(target, r))
     whole = None if mask is None else _whole_windows(pad_panorama(mask, r))

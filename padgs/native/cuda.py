@@ -197,10 +197,7 @@ def check_device(index: int) -> None:
 
 
 def call(name: str, where: Queue, *arguments: Any) -> None:
-    """Call a function that returns a cudaError_t, which is raised; structures are passed by reference.
-
-    Errors of kernels may be reported later than they happen.
-    """
+    """Call a function that returns a cudaError_t, which is raised; structures are passed by reference."""
     references = (ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments)
     raise_for(getattr(library(), name)(ctypes.byref(where), *references), name)
 

@@ -68,10 +68,7 @@ class Progress:
 
 
 class RunStore:
-    """Reads and writes the files of one run; as a context manager, it holds the lock of the run folder.
-
-    If a file cannot be written, a RunFolderError says so.
-    """
+    """Files of one run, locked while it is a context manager; RunFolderError if a file cannot be written."""
 
     def __init__(self, path: Path, run: Mapping[str, str] | None = None) -> None:
         """Open a run folder; `run` is the `identity` that its checkpoint must have, None for any."""

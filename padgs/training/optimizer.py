@@ -21,10 +21,7 @@ READ_EVERY = 10  # iterations between reads of the loss from a GPU
 
 
 def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam | None, keep: Tensor) -> None:
-    """Keep only some rows of every parameter, with their Adam moments if there are any.
-
-    `keep` is [N] bool, or row numbers [M] in the wanted order; all parameters have N rows.
-    """
+    """Keep rows of every parameter [N, ...] with their Adam moments: [N] bool, or row numbers in the wanted order."""
     for parameter in parameters.values():
         parameter.data = parameter.data[keep]
         parameter.grad = None

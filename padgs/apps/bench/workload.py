@@ -72,10 +72,7 @@ class Workload:
         return self.scene.train[0]
 
     def trainer(self, *, grows: bool = False, stage: Stage = nullcontext) -> Trainer:
-        """Return a trainer with learning rates near 0, so that all iterations do the same work.
-
-        `grows`: densify in every iteration; otherwise statistics are collected and never used.
-        """
+        """Return a trainer with learning rates near 0, so that iterations do the same work; `grows`: each densifies."""
         grow_from = 0 if grows else NEVER
         growth = GrowthOptions(statistics_from=0, grow_from=grow_from, grow_until=NEVER, grow_every=1 if grows else 100)
         trainee = AnchorModel(self.model, OPTIONS, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)

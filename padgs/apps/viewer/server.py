@@ -186,10 +186,7 @@ def has_screen() -> bool:
 
 
 def wait_for_checkpoint(folder: str | Path) -> None:
-    """Return when a run has a checkpoint, or will have none; opening it then reports the reason.
-
-    A ValueError says that the run was started, but no process trains it.
-    """
+    """Return when a run has a checkpoint, or will have none; a ValueError if no process trains it."""
     from padgs.runs.store import RunStore
 
     store, printed = RunStore(Path(folder)), False

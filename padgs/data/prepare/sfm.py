@@ -42,10 +42,7 @@ class Group:
 def extract_features(
     database: Path, folder: Path, groups: Sequence[Group], masks: Path | None, threads: int, progress: Progress
 ) -> None:
-    """Extract features of all images that are not in the database, which is created if missing.
-
-    `masks` is a folder with <image name>.png for every image, 0 = ignore.
-    """
+    """Extract features of images that are not in the database; `masks` has <image name>.png for each, 0 = ignore."""
     pycolmap = pycolmap_module()
     cameras = _register(database, groups)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
@@ -112,10 +109,7 @@ def make_rig(database: Path, config: Any) -> None:
 def match(
     database: Path, pairs: Sequence[Sequence[tuple[str, str]]], rig: bool, threads: int, seed: int, progress: Progress
 ) -> None:
-    """Match and verify groups of pairs of images that have no matches in the database.
-
-    For a rig, a group is all pairs of views of two panoramas, which are verified jointly.
-    """
+    """Match and verify groups of unmatched pairs of images; a rig's group, all views of two panoramas, jointly."""
     pycolmap = pycolmap_module()
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
     matching.rig_verification = matching.skip_image_pairs_in_same_frame = rig

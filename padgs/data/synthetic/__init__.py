@@ -46,10 +46,7 @@ def load(path: str | Path, options: DataOptions) -> Scene:
 
 
 def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scene:
-    """Generate a scene, or read it from the disk cache.
-
-    Takes 15-20 s of processor time for 30 views at 512 x 256, on all processors. `store` caches decoded images.
-    """
+    """Generate a scene, or read it from the disk cache; 30 views at 512x256 take 15-20 s of CPU time."""
     stored, notes = read_cache(options), []
     if stored is None:
         stored = _make(options)

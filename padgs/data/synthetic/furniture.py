@@ -157,10 +157,7 @@ def scatter(
     rng: np.random.Generator,
     reflectance: float = 0.0,
 ) -> list[Shape]:
-    """Place loose objects in a box, apart from each other and at least `clearance` from the camera path.
-
-    Objects in the lower part stand on thin rods, the others float.
-    """
+    """Place loose objects in a box, apart from each other and from the camera path; low ones stand on thin rods."""
     shapes: list[Shape] = []
     positions, sizes = np.empty((0, 3)), np.empty(0)
     for _ in range(count):

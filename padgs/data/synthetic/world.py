@@ -183,10 +183,7 @@ class World:
     def color(
         self, origin: Array, direction: Array, candidates: Sequence[int] | None = None, *, reflect: bool = True
     ) -> Array:
-        """Return colours [3, n] float32 along rays [3, n] float32; fastest for narrow bundles.
-
-        `candidates` are the indices of shapes to test, those that the bundle can hit if None.
-        """
+        """Return colours [3, n] float32 along rays [3, n]; `candidates` None: the shapes that the bundle can hit."""
         if candidates is None:
             candidates = self._within(origin, direction)
         distance, object_id = self.nearest(origin, direction, candidates)

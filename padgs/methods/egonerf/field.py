@@ -62,10 +62,7 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class EgoNeRFOptions:
-    """The model, and its training as published for Ricoh360.
-
-    Lengths are in scene scales, ours; None: the published value for the surroundings.
-    """
+    """The model and its training as published for Ricoh360. Lengths are in scene scales; None: published value."""
 
     radial_nodes: int = 150  # of each chart
     polar_nodes: int = 172  # of each chart

@@ -41,10 +41,7 @@ MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more th
 
 
 def solid_angle_pixels(view: View) -> float:
-    """Return the number of independent pixels of a panorama: W H times the mean cosine of the latitude, 2 / pi.
-
-    At least `MIN_PIXELS`.
-    """
+    """Return the independent pixels of a panorama, W H times the mean cosine 2 / pi, at least `MIN_PIXELS`."""
     return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)
 
 

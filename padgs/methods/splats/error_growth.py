@@ -39,10 +39,7 @@ class WrongPixels:
 
     @torch.no_grad()
     def observe(self, view: View, rendering: Rendering) -> None:
-        """Draw candidates from a rendered training view; those of the oldest view go.
-
-        Errors are those of the photograph as it is, without learned exposures.
-        """
+        """Draw candidates from a rendered training view and its photograph as it is; those of the oldest view go."""
         image = image_of(view, rendering.image.device)
         error = (rendering.image - image).abs().mean(-1) * even_weight(view, image.device)
         surface = (rendering.transmittance < MAX_TRANSMITTANCE) & (rendering.depth > 0)

@@ -69,10 +69,7 @@ class Splats(nn.Module):
         scale: float = 1.0,
         generator: torch.Generator,
     ) -> Splats:
-        """Return one Gaussian per point of the cloud; a random subset if there are more than `max_gaussians` points.
-
-        `scale` is a factor on `initial_scales`; `generator` is on the CPU.
-        """
+        """Return one Gaussian per point, or a random `max_gaussians`; `scale` is a factor on `initial_scales`."""
         points, colors = scene.points.float(), scene.point_colors.float() / 255
         refuse_unusable(points, "Gaussians")
         if max_gaussians is not None and len(points) > max_gaussians:
