@@ -178,21 +178,20 @@ def exit_on_errors() -> Iterator[None]:
         yield
     except BrokenPipeError:  # the reader of the output has ended
         raise
-    except MissingConfigException as error:
-        group, _, name = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
-        complain(unknown(group, name, error.options or ()))
+    except (HydraException, *EXPECTED) as error:
+        complain(_message(error))
         sys.exit(1)
-    except OverrideParseException as error:
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, MissingConfigException):
+        group, _, name = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
+        return unknown(group, name, error.options or ())
+    if isinstance(error, OverrideParseException):
         key, _, value = error.override.lstrip("+").partition("=")
         rule = "values with spaces or any of ,;:{}[]()'\" need quotes"
-        complain(f"{key}={value} cannot be read: {rule}, e.g. padgs-run '{key}=\"VALUE\"'")
-        sys.exit(1)
-    except HydraException as error:
-        complain("\n".join(map(str, filter(None, (error, error.__cause__)))))
-        sys.exit(1)
-    except EXPECTED as error:
-        complain(str(error))
-        sys.exit(1)
+        return f"{key}={value} cannot be read: {rule}, e.g. padgs-run '{key}=\"VALUE\"'"
+    return f"{error}\n{error.__cause__}" if isinstance(error, HydraException) and error.__cause__ else str(error)
 
 
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:

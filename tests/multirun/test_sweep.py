@@ -100,32 +100,29 @@ def test_only_missing_jobs_are_launched(tmp_path):
     assert more.counts() == {"ok": 3} and more.launched == ["++seed=2"]
 
 
-class InArrays(Start):
-    def launch(self, jobs, initial_job_idx):
-        if len(jobs) > 2:
-            raise RuntimeError("more than an array may have")
-        super().launch(jobs, initial_job_idx)
-
-
-def test_jobs_are_launched_in_batches(tmp_path):
-    assert InArrays(tmp_path, 1, ELSEWHERE).counts(2) == {"ok": 3}
-
-
 class Refusing(Start):
     def launch(self, jobs, initial_job_idx):
-        if len(jobs) > 1 or self.reason == "invalid partition":
+        if len(jobs) > self.most:
             raise SubmissionRefused(self.reason)
         super().launch(jobs, initial_job_idx)
 
 
 @pytest.mark.parametrize(
-    ("reason", "counts"),
-    [("Invalid job array specification", {"ok": 3}), ("invalid partition", {"refused": 3})],
+    ("most", "batch_size", "reason", "counts"),
+    [
+        (2, 2, "", {"ok": 3}),
+        (1, None, "Invalid job array specification", {"ok": 3}),
+        (0, None, "invalid partition", {"refused": 3}),
+    ],
 )
-def test_arrays_that_slurm_refuses_are_submitted_in_parts_if_that_may_help(tmp_path, capsys, reason, counts):
+def test_arrays_that_slurm_refuses_are_submitted_in_parts_if_that_may_help(
+    tmp_path, capsys, most, batch_size, reason, counts
+):
     start = Refusing(tmp_path, 1, ELSEWHERE)
-    start.reason = reason
-    assert start.counts() == counts and (reason in capsys.readouterr().err) == ("refused" in counts)
+    start.most, start.reason = most, reason
+    assert start.counts(batch_size) == counts and (f"error: {reason}" in capsys.readouterr().err) == (
+        "refused" in counts
+    )
 
 
 def test_slurm_jobs_are_followed_until_the_queue_has_none_of_them(tmp_path, monkeypatch):
@@ -142,28 +139,18 @@ def test_slurm_jobs_are_followed_until_the_queue_has_none_of_them(tmp_path, monk
 
 class OneFails(Start):
     def end(self, number, job):
-        self.finish(number, job, "nan" if job == "++seed=1" else "ok")
+        self.finish(number, job, self.failure if job == "++seed=1" else "ok")
 
 
-def test_failed_runs_are_retried_only_on_request(tmp_path, capsys):
+@pytest.mark.parametrize(("failure", "repeated"), [("nan", ["++seed=1"]), ("timeout", [])])
+def test_failed_runs_are_retried_only_on_request_and_those_out_of_time_never(tmp_path, failure, repeated):
     first = OneFails(tmp_path, 1, ELSEWHERE)
-    assert first.counts() == {"ok": 2, "nan": 1} and "retry=failed" in first.out.getvalue()
+    first.failure, counts = failure, {"ok": 2, failure: 1}
+    assert first.counts() == counts and ("retry=failed" in first.out.getvalue()) == bool(repeated)
     kept = Start(tmp_path, 2, ELSEWHERE)
-    assert kept.counts() == {"ok": 2, "nan": 1} and kept.launched == []
+    assert kept.counts() == counts and kept.launched == []
     retried = Start(tmp_path, 3, ELSEWHERE, retry="failed")
-    assert retried.counts() == {"ok": 3} and retried.launched == ["++seed=1"]
-
-
-class OneRunsOutOfTime(Start):
-    def end(self, number, job):
-        self.finish(number, job, "timeout" if job == "++seed=1" else "ok")
-
-
-def test_a_run_out_of_time_is_not_retried(tmp_path):
-    first = OneRunsOutOfTime(tmp_path, 1, ELSEWHERE)
-    assert first.counts() == {"ok": 2, "timeout": 1} and "retry=failed" not in first.out.getvalue()
-    again = Start(tmp_path, 2, ELSEWHERE, retry="failed")
-    assert again.counts() == {"ok": 2, "timeout": 1} and again.launched == []
+    assert retried.counts() == ({"ok": 3} if repeated else counts) and retried.launched == repeated
 
 
 class OneKills(Start):
