@@ -56,5 +56,6 @@ def view(
         of_one_scene()  # raises before the page is served
     try:
         serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
-    finally:
+    except KeyboardInterrupt:  # the way to end it
         show(f"next: {shlex.join(['padgs', 'render', run])}  (--path film.json after saving a film)")
+        raise

@@ -38,6 +38,14 @@ def test_local_pages_are_opened_in_a_browser(monkeypatch, local, browse, opens):
     assert shown == [*opens * ["http://here"], "a run"], "browsers load the page while the run is being opened"
 
 
+@pytest.mark.parametrize(("ends", "code", "is_named"), [(KeyboardInterrupt, 130, True), (OSError("no host"), 1, False)])
+def test_the_next_command_is_named_at_its_end_and_after_no_error(tmp_path, monkeypatch, ends, code, is_named):
+    (tmp_path / "config.yaml").touch()
+    monkeypatch.setattr(process, "serve", MagicMock(side_effect=ends))
+    done = CliRunner().invoke(app, ["view", str(tmp_path)])
+    assert (done.exit_code, f"next: padgs render {tmp_path}" in done.stdout) == (code, is_named), done.output
+
+
 def test_the_page_is_served_before_torch_is_loaded():
     code = "import sys, viser, padgs.cli.view, padgs.apps.viewer.server; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
