@@ -73,7 +73,7 @@ refuse() { echo "error: $*" >&2; exit 1; }
 # End the runs of a step, which write checkpoints, then this script.
 stop() {
   trap '' INT TERM HUP
-  kill -s INT -- "-$worker" || true
+  kill -s TERM -- "-$worker" || true
   wait "$worker" || true
   echo "stopped; the same command resumes" >&2
   exit 130
@@ -83,14 +83,16 @@ stop() {
 take() {
   local step=$1 run settings
   [ -e "$out/$step.sitting" ] || sitting >"$out/$step.sitting"
+  trap : TERM  # wait for the runs, which end with checkpoints
   commands | while read -r name _ _ settings; do
+    trap : TERM
     if [ "$name" != "$step" ]; then continue; fi
     # shellcheck disable=SC2086
     run=($bin/padgs-run -m $settings run.folder=$out/runs run.threads=1 tracking=none)
     if [ "$jobs" != 1 ]; then run+=(launcher=local run.jobs="$jobs"); fi
     echo "${run[*]}" >>"$out/$step.log"
     status=0
-    "${run[@]}" </dev/null 2>&1 | tee -ai "$out/$step.log" || status=$?
+    "${run[@]}" </dev/null 2>&1 | (trap '' INT TERM; exec tee -a "$out/$step.log") || status=$?
     if [ $status -gt 1 ]; then exit $status; fi
     # Status 1 is also that of a run which failed, which is a result.
     if grep ' done' "$out/$step.log" | tail -n 1 | grep -qE 'refused|crashed|killed|elsewhere|waiting|stopped'; then exit 1; fi

@@ -84,8 +84,9 @@ def test_a_stopped_step_is_resumed_and_one_without_all_results_tried_again(measu
 def test_a_signal_to_the_script_alone_ends_its_runs_and_it_resumes(measure, tmp_path):
     settings = {**os.environ, "BIN": "bin", "CALLS": str(tmp_path / "build/calls"), "WAIT": "60"}
     script = tmp_path / "reports" / SCRIPT.name
-    started = subprocess.Popen([script, "J-court"], env=settings, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    while not list(tmp_path.glob("build/campaign/runs/*/result.json")):
+    in_background = ["bash", "-c", 'trap "" INT; exec "$0" J-court', script]  # `&` of a script ignores Ctrl-C
+    started = subprocess.Popen(in_background, env=settings, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    while started.poll() is None and not list(tmp_path.glob("build/campaign/runs/*/result.json")):
         time.sleep(0.05)
     started.terminate()
     output, _ = started.communicate(timeout=30)
