@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
@@ -33,7 +34,7 @@ from padgs.geometry.distortion import solid_angle_weight
 from padgs.methods.splats.depth_initialization import visible_points
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of
-from padgs.runs.console import show_result
+from padgs.runs.console import say, show_result
 from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import build_method, initial_result, load_scene, scored, start
 from padgs.runs.store import Progress, RunStore
@@ -127,7 +128,7 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     owner = _owners(train, seen, points, clusters)
     rays = Panorama(2 * ROWS, ROWS).rays(dtype=torch.float64).reshape(-1, 3).numpy()
     share = np.zeros((len(views), count))  # of the sphere of each view that belongs to each block
-    directions: dict[tuple[int, int], np.ndarray] = {}  # view, block -> directions that belong to it
+    held: list[dict[str, np.ndarray]] = [{} for _ in clusters]
     for row, view in enumerate(views):
         if not len(index := seen[row].nonzero()[0]):
             continue
@@ -135,24 +136,21 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
         tree = KDTree(torch.nn.functional.normalize(toward, dim=1).numpy())
         near = owner[index][tree.query(rays, k=min(NEIGHBOURS, len(index)))[1]].reshape(len(rays), -1)
         for block in range(count):
-            held = ((near == block).mean(1) >= 0.5).reshape(ROWS, 2 * ROWS)
-            share[row, block] = sphere_share(held)
-            if share[row, block] >= MARGIN:
-                around = np.hstack([held] * 3)  # continued across the seam
-                directions[row, block] = binary_dilation(around, iterations=RIM)[:, 2 * ROWS : 4 * ROWS]
-    margin, held_by, tests, used = [], [], [], np.zeros((count, len(points)), bool)
+            inside = ((near == block).mean(1) >= 0.5).reshape(ROWS, 2 * ROWS)
+            share[row, block] = sphere_share(inside)
+            if row < len(train) and share[row, block] >= MARGIN:
+                around = np.hstack([inside] * 3)  # continued across the seam
+                held[block][view.name] = binary_dilation(around, iterations=RIM)[:, 2 * ROWS : 4 * ROWS]
+    margin, tests, used = [], [], np.zeros((count, len(points)), bool)
     best = share[len(train) :].argmax(1) if test else np.zeros(0, int)
     for block, cluster in enumerate(clusters):
         others = np.setdiff1d(views_of_train, cluster)
-        margin.append([train[n] for n in others.tolist() if (n, block) in directions])
-        held_by.append(
-            {train[n].name: held for (n, one), held in directions.items() if one == block and n < len(train)}
-        )
+        margin.append([train[n] for n in others if train[n].name in held[block]])
         own = (best == block).nonzero()[0].tolist()
         own = own or [int(share[len(train) :, block].argmax())] if test else []
         tests.append([test[n] for n in own])
         used[block] = (seen[cluster].mean(0) >= SEEN) | (owner == block)
-    return Plan(points, owner, [[train[n] for n in part] for part in clusters], margin, held_by, tests, used)
+    return Plan(points, owner, [[train[n] for n in part] for part in clusters], margin, held, tests, used)
 
 
 def sphere_share(held: np.ndarray) -> float:
@@ -291,6 +289,8 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
         )
         result = store.finish(scored(config, scene, store, result, method) if scene.test else result)
     show_result(result, store.path, console)
+    refine = ["padgs-run", f"data.path={config.data.path}", f"init={store.path}", "train.refine=true"]
+    say(console, f"to join the blocks, with their other settings: {shlex.join(refine)}", "dim")
     return store.path
 
 

@@ -108,7 +108,7 @@ def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
 
 def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, capsys):
     path = merge(runs, Console(width=200))
-    assert str(path) in capsys.readouterr().out
+    assert f"padgs-run data.path={source} init={path} train.refine=true" in capsys.readouterr().out
     merged, loaded = padgs.load_run(path, device="cpu"), [padgs.load_run(one, device="cpu") for one in runs]
     assert merged.result.ok and merged.result.variant == "2 blocks, continued"
     assert merged.config.data.path == str(source)
