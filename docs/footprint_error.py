@@ -96,12 +96,10 @@ def _on_faces(gaussian: Gaussians, panorama: Panorama, directions: Tensor) -> Te
     return footprint.view(panorama.height, panorama.width)
 
 
-def _values(
-    gaussian: Gaussians, pose: Tensor, camera: Camera, projection: str, rows: Tensor, columns: Tensor
-) -> Tensor:
+def _values(gaussian: Gaussians, pose: Tensor, lens: Camera, projection: str, rows: Tensor, columns: Tensor) -> Tensor:
     """Return exp(-q / 2) at pixels [P], which may lie between pixel centres in a plane."""
     options = RenderOptions(projection=projection, low_pass=0.0)
-    footprints = project(Request(gaussian, pose, camera, options, background=pose.new_zeros(3)))
+    footprints = project(Request(gaussian, pose, lens, options, background=pose.new_zeros(3)))
     if isinstance(footprints, PlanarFootprints):  # boxes belong to the cut at 1/255, which is not applied here
         everywhere = footprints.boxes.new_tensor([[-math.inf, math.inf, -math.inf, math.inf]])
         footprints = replace(footprints, boxes=everywhere)

@@ -88,10 +88,7 @@ class Scene:
     origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
     def recentered(self) -> Scene:
-        """Return the scene with float32 points, moved to the origin if its cameras are more than `FAR` scales from it.
-
-        Georeferenced captures are so far away that float32 coordinates would blur them.
-        """
+        """Return the scene with float32 points, moved to the origin if its cameras are too far away for float32."""
         middle = torch.stack([view.center for view in self.train]).double().median(0).values
         distance = middle.norm() / self.scale
         if not distance > FAR:

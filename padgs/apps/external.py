@@ -19,14 +19,7 @@ import torch
 
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import CONVERTED, read_splats
-from padgs.apps.frame_check import (
-    FrameCheck,
-    check_frame,
-    composed,
-    nerfstudio_similarity,
-    read_transform,
-    shifted,
-)
+from padgs.apps.frame_check import FrameCheck, check_frame, nerfstudio_similarity, read_transform
 from padgs.checks import unknown
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.path_file import TRANSFORMS
@@ -151,7 +144,7 @@ class ExternalRun(LoadedRun):
         else:
             scene = load_scene(config, choose_device(device, render))
             if scene.origin.any() and program[0] != "padgs":  # whose exports are in the world of `scene`
-                splats = transform_splats(splats, shifted(-scene.origin))
+                splats = transform_splats(splats, Similarity(translation=-scene.origin.double().cpu()))
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
         config = replace(config, options=ExternalOptions(digest, transform))
         splats.scene_scale = scene.scale
@@ -173,12 +166,13 @@ class ExternalRun(LoadedRun):
 
         known = self.folder.parent / TRANSFORMS
         nerfstudio = nerfstudio_similarity(known, _transforms_json(self.config)) if known.is_file() else None
-        found, given = check_frame(self.scene, render, opaque, nerfstudio), self.given or shifted(torch.zeros(3))
+        found, given = check_frame(self.scene, render, opaque, nerfstudio), self.given or Similarity()
         if found.suggestion is None:
             return found
-        origin = torch.zeros(3) if self.program[0] == "padgs" else self.scene.origin  # as `open` moved the Gaussians
-        in_data = composed(shifted(origin), composed(found.suggestion, composed(shifted(-origin), given)))
-        return replace(found, suggestion=in_data)
+        if self.program[0] == "padgs":
+            return replace(found, suggestion=found.suggestion @ given)
+        shift = Similarity(translation=self.scene.origin.double().cpu())  # `open` moved the Gaussians by its inverse
+        return replace(found, suggestion=shift @ found.suggestion @ shift.inverse() @ given)
 
 
 def open_model(
@@ -235,10 +229,7 @@ class Renders:
 
     @classmethod
     def find(cls, folder: Path, scene: Scene) -> Renders:
-        """Find NAME.png for each test view NAME; folders in names are folders, or written as dashes.
-
-        A DataError names what is missing, of another size, or no 8-bit image without transparency.
-        """
+        """Find NAME.png for each test view NAME, where / may be a dash; a DataError names what is missing or unfit."""
         files, missing = dict[str, Path](), []
         for view in scene.test:
             names = (f"{view.name}.png", str(Path(view.name).with_suffix(".png")), picture_name(view.name))

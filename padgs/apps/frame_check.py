@@ -1,8 +1,7 @@
 """World of a file of Gaussians: transforms that users state, and a check that the file's world is the scene's."""
 
-import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
     world of the data set to that of the model; it includes the `applied_transform` of the data set's `transforms_json`.
     """
     if text == IDENTITY:
-        return shifted(torch.zeros(3))
+        return Similarity()
     file = Path(text)
     try:
         if not file.is_file():
@@ -67,17 +66,6 @@ def _similarity(matrix: np.ndarray, text: str) -> Similarity:
         raise ValueError(f"--transform {text} shears, or scales axes differently; {rule}")
     u, _, vh = np.linalg.svd(rotation)
     return Similarity(float(scale), torch.from_numpy(u @ vh), torch.from_numpy(matrix[:3, 3].copy()))
-
-
-def shifted(by: Tensor) -> Similarity:
-    """Return the translation by a vector [3]."""
-    return Similarity(1.0, torch.eye(3, dtype=torch.float64), by.double().cpu())
-
-
-def composed(outer: Similarity, inner: Similarity) -> Similarity:
-    """Return the similarity that applies `inner`, then `outer`."""
-    scale, rotation = outer.scale * inner.scale, outer.rotation @ inner.rotation
-    return Similarity(scale, rotation, outer(inner.translation.to(outer.translation)))
 
 
 def nerfstudio_similarity(file: Path, transforms_json: Path | None) -> Similarity:
@@ -123,10 +111,7 @@ class FrameCheck:
 
 
 def check_frame(
-    scene: Scene,
-    render: Callable[[Similarity, View], Rendering],
-    means: Tensor,
-    nerfstudio: Similarity | None = None,
+    scene: Scene, render: Callable[[Similarity, View], Rendering], means: Tensor, nerfstudio: Similarity | None = None
 ) -> FrameCheck:
     """Render training views at a low resolution, and search for a better world if they do not fit.
 
@@ -147,7 +132,7 @@ def check_frame(
         return torch.stack(marks).mean().item()
 
     flat = torch.stack([mean_color(truth, mask) for _, truth, mask in truths]).mean().item()
-    found = FrameCheck(quality(shifted(torch.zeros(3))), flat)
+    found = FrameCheck(quality(Similarity()), flat)
     if found.psnr >= flat + MARGIN or not len(means):
         return found
     best = found
@@ -171,34 +156,23 @@ def _small(view: View) -> tuple[View, Tensor, Tensor | None]:
 
 def _worlds(scene: Scene, means: Tensor, nerfstudio: Similarity | None) -> Iterator[tuple[str, Similarity]]:
     """Yield worlds that a file may be in: nerfstudio's, those with other axes, and those aligned to the points."""
+    from scipy.spatial.transform import Rotation
+
     if nerfstudio is not None:
         yield f"with nerfstudio's {TRANSFORMS}", nerfstudio
-    turns = [torch.from_numpy(turn) for turn in _axis_rotations()]
+    turns = torch.from_numpy(Rotation.create_group("O").as_matrix().round())  # axes to axes, the identity first
     for turn in turns[1:]:
-        yield "with other axes", Similarity(1.0, turn, torch.zeros(3).double())
-    starts = [_closest_points(scene.points, means, Similarity(0.0, turn, torch.zeros(3)), *COARSE) for turn in turns]
+        yield "with other axes", Similarity(rotation=turn)
+    starts = [_closest_points(scene.points, means, Similarity(0.0, turn), *COARSE) for turn in turns]
     for _, start in sorted(starts, key=lambda found: found[0])[:FINALISTS]:
         aligned = _closest_points(scene.points, means, start, *FINE)[1]
         yield "with another scale and place (estimated from points)", aligned
 
 
-def _axis_rotations() -> Sequence[np.ndarray]:
-    """Return the 24 rotations that map axes to axes, the identity first."""
-    signed = [
-        np.diag(signs) @ np.eye(3)[list(order)]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
-    return [matrix for matrix in signed if np.linalg.det(matrix) > 0]
-
-
 def _closest_points(
     points: Tensor, means: Tensor, start: Similarity, count: int, iterations: int
 ) -> tuple[float, Similarity]:
-    """Align means to points by iterative closest points, from medians and spreads if `start` has scale 0.
-
-    Also return the median distance.
-    """
+    """Align means to points iteratively, first by medians if `start` has scale 0; return the median distance, too."""
     from scipy.spatial import KDTree
 
     target, source = (cloud[:: max(1, len(cloud) // count)].double().cpu().numpy() for cloud in (points, means))

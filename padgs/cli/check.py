@@ -18,8 +18,7 @@ def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
     overlay: Annotated[
-        str | None,
-        typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none"),
+        str | None, typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none")
     ] = None,
     mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
     depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",

@@ -17,9 +17,7 @@ def convert(
     to: Annotated[str, typer.Option(help=f"the format to write: {FORMATS}")],
     format: Annotated[str, typer.Option(help=f"format of the source: auto, one of these, or {SOURCES}")] = "auto",
     width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
-    points: Annotated[
-        str, typer.Option(help="auto, random, or a PLY, LAS or E57 file in the source's folder")
-    ] = "auto",
+    points: Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of the source")] = "auto",
     mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
     depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",

@@ -11,12 +11,9 @@ def export(
     run: Run,
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="at least a pixel wide, for viewers; .html always is")
-    ] = False,
+    smooth: Annotated[bool, typer.Option("--smooth", help="at least a pixel wide, as .html always is")] = False,
     distillation_steps: Annotated[
-        int | None,
-        typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300"),
+        int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
     ] = None,
     crop: Annotated[
         str, typer.Option(help="box of the scene to keep, six numbers: lowest and highest x y z; padgs view shows them")

@@ -12,9 +12,7 @@ MAX_SIDE, MAX_FRAMES = 16384, 100_000  # larger images and longer videos fill th
 def render(
     run: Model,
     to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; default: video.mp4 in the run's folder")] = "",
-    path: Annotated[
-        str, typer.Option(help="cameras, orbit, dolly, or a JSON: keyframes, nerfstudio's path")
-    ] = "cameras",
+    path: Annotated[str, typer.Option(help="cameras, orbit, dolly, or a JSON of keyframes or nerfstudio")] = "cameras",
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
     fov: Annotated[float | None, typer.Option(help="horizontal degrees of a perspective image; default 90")] = None,
     width: Annotated[int, typer.Option(help="pixels; 0: as the run, half of it in perspective")] = 0,

@@ -22,22 +22,16 @@ def report(
     out: Annotated[str, typer.Option(help="folder of the files; default: reports in or beside RUNS")] = "",
     protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
-    metric: Annotated[
-        list[str] | None, typer.Option(help="columns of tables and curves of sweeps, e.g. ws_psnr; repeatable")
-    ] = None,
+    metric: Annotated[list[str] | None, typer.Option(help="of tables and curves, e.g. ws_psnr; repeatable")] = None,
     method: Annotated[list[str] | None, typer.Option(help="only these methods, e.g. odgs,padgs*; repeatable")] = None,
-    scene: Annotated[
-        list[str] | None, typer.Option(help="only these scenes or data sets, e.g. room,roam360; repeatable")
-    ] = None,
+    scene: Annotated[list[str] | None, typer.Option(help="only these scenes or data sets, as a,b; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
     mix: Annotated[bool, typer.Option(help="compare runs with different rules, sizes, lengths and machines")] = False,
     collect: Annotated[
         bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
     ] = False,
     svg: Annotated[bool, typer.Option(help="write charts as SVG, too")] = False,
-    strict: Annotated[
-        bool, typer.Option(help="exit code 1 if a result file is unusable or runs must not be compared")
-    ] = False,
+    strict: Annotated[bool, typer.Option(help="exit code 1 for unusable files or runs that do not compare")] = False,
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (PNG, CSV) and a page (HTML) from result files."""
     if what not in (*REPORTS, ALL):

@@ -9,9 +9,7 @@ from padgs.cli.errors import Rays, Transform, check_range, show
 
 
 def score(
-    model: Annotated[
-        str, typer.Argument(help=".ply, .compressed.ply, .spz, .sog, or a folder with NAME.png for each test view")
-    ],
+    model: Annotated[str, typer.Argument(help="a .ply, .spz or .sog, or a folder with NAME.png for each test view")],
     data: Annotated[str, typer.Option(help="folder of the data set, or of a run on it")],
     label: Annotated[str, typer.Option(help="name in tables; default: the program that the file names")] = "",
     rays: Rays = "exact",

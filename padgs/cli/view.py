@@ -20,8 +20,7 @@ def view(
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
     port: Annotated[int | None, typer.Option(help="the first one to try; default 8080")] = None,
     host: Annotated[
-        str | None,
-        typer.Option(help="0.0.0.0 serves all who have the printed address; default: this machine only"),
+        str | None, typer.Option(help="0.0.0.0 serves all who have the printed address; default: this machine only")
     ] = None,
     data: DataPath = None,
     rays: Rays = "exact",

@@ -81,10 +81,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
 
 
 def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]:
-    """Return the folder that keeps decoded images of so many bytes in all if they exceed the memory for them; a note.
-
-    There is none if it would take more than half of the free space.
-    """
+    """Return the folder for decoded images beyond the memory, none if it would take half of the free space; a note."""
     if size <= options.cache_bytes or options.disk_cache == "off":
         return None, []
     folder = Path(options.disk_cache) if options.disk_cache != "auto" else cache_root() / "images"
@@ -106,10 +103,7 @@ def view_name(frame_name: str) -> str:
 
 
 def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_FOLDERS) -> Path:
-    """Return the given image folder of a data set, else the first existing usual one, else its own folder.
-
-    A DataError says that the given folder does not exist.
-    """
+    """Return the given folder (a DataError if missing), else the first usual one that exists, else that of the data."""
     if given is not None:
         if not (folder / given).is_dir():
             raise DataError(f"data.images={given}: there is no folder {folder / given}")
@@ -150,10 +144,7 @@ def refuse_clashes(names: Sequence[str]) -> None:
 
 
 def found_images(capture: Capture) -> Capture:
-    """Find images whose stated names differ from their files in leading folders, Unicode form or extension.
-
-    A DataError says that a name points outside the image folder, and that no end of it is there.
-    """
+    """Find images whose names differ from files in leading folders, Unicode form or ending; a DataError if none is."""
     there = {frame.name for frame in capture.frames if is_inside(frame.name) and os.path.isfile(frame.image)}
     if len(there) == len(capture.frames):
         return capture

@@ -76,10 +76,7 @@ def interpolate_poses(poses: Tensor, times: Sequence[float] | np.ndarray) -> Ten
 
 
 def along_cameras(scene: Scene, frames: int) -> Tensor:
-    """Return a smooth path of constant speed through the training cameras, in the order of their names.
-
-    A ValueError says that there is only one camera, or that all share one centre.
-    """
+    """Return a smooth path of constant speed through training cameras by name; a ValueError if they share a centre."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.spatial.transform import Rotation
 

@@ -276,10 +276,7 @@ def _small(views: Sequence[View]) -> Tensor:
 
 
 def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:
-    """Save a panorama with points [P, 3] of the world drawn on it as PNG, red = near, blue = far (by rank).
-
-    Clouds of more than `most` points are thinned out evenly. A DataError says that the file cannot be written.
-    """
+    """Save a panorama with at most `most` points [P, 3] drawn on it as PNG, red = near, blue = far (by rank)."""
     assert view.load_pixels is not None
     image = Image.fromarray(view.load_pixels().cpu().numpy())
     if image.width > MAX_WIDTH:

@@ -76,10 +76,7 @@ def whole_if_possible(values: NDArray[np.float64]) -> NDArray[Any]:
 
 
 def read_vertices(path: Path) -> tuple[Any, set[str]]:
-    """Return the vertices of a PLY file, one column per property, and the names of properties that are numbers.
-
-    A DataError says that the file is missing, no PLY file, truncated, or without vertices.
-    """
+    """Return the columns of a PLY file's vertices, and the names of those that are numbers; else a DataError."""
     from plyfile import PlyData, PlyListProperty, PlyParseError
 
     refuse_special(path)

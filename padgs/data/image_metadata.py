@@ -91,10 +91,7 @@ def refuse_several_pictures(image: Image.Image, path: object) -> None:
 
 
 def crop_of(image: Image.Image, path: object) -> Crop | None:
-    """Return where the picture lies in its panorama by GPano metadata; None if it is the whole panorama.
-
-    A DataError names another projection, or numbers that contradict each other.
-    """
+    """Return where the picture lies in its panorama (GPano); None if it is all; a DataError if numbers disagree."""
     xmp = _xmp(image)
     projection = stated(xmp, "ProjectionType")
     if projection is not None and projection.casefold() != "equirectangular":

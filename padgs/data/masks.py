@@ -217,10 +217,7 @@ def _in_folder(folder: Path, name: str, beside: bool, listings: dict[Path, dict[
 
 
 def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:
-    """Write mask.png if all views share a mask, else masks/ with one file per masked view.
-
-    `masks` holds the function that loads the weights [H, W] of each view. At most two masks are in memory at a time.
-    """
+    """Write mask.png if all views share a mask, else masks/ with a file per masked view; `masks` load their weights."""
     loaders = {name: load for name, load in masks.items() if load is not None}
     if loaders and len(loaders) == len(masks):
         first, *others = loaders.values()

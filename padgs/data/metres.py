@@ -20,7 +20,7 @@ from padgs.data.capture import Cloud, DataError, Frame, listed
 from padgs.files import open_image
 from padgs.geometry.similarity import Similarity
 
-UNIT = "unit.json"
+UNIT, Z = "unit.json", (0.0, 0.0, 1.0)
 UPRIGHT = 0.9  # minimal length of the mean of the cameras' up directions
 _FLOOR = 0.03  # half of the layer that is taken for the floor, relative to the height of the cameras
 _MIN_FLOOR_POINTS, _MIN_FLOOR_SHARE = 30, 0.02  # in that layer, and of the points below the cameras
@@ -73,12 +73,6 @@ def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) 
     return change, f"lengths are in metres, {note}; before: times {change.scale:.6g}"
 
 
-def scaled(scale: float, rotation: Tensor | None = None) -> Similarity:
-    """Return the similarity with a scale, and perhaps a rotation, about the origin."""
-    zeros = torch.zeros(3, dtype=torch.float64)
-    return Similarity(scale, torch.eye(3, dtype=torch.float64) if rotation is None else rotation, zeros)
-
-
 def write_unit(folder: Path, note: str) -> None:
     """State that the data set in a folder is in metres."""
     (folder / UNIT).write_text(json.dumps({"unit": "metre", "note": note}, indent=2) + "\n", encoding="utf-8")
@@ -110,7 +104,7 @@ def _by_distance(
     extent = (centers(poses) - centers(poses).mean(0)).norm(dim=1).max().item()
     if distance <= 1e-6 * extent:
         raise DataError(f"--metres: {first} and {second} were taken at one place; name two cameras far apart")
-    return scaled(metres / distance), f"by {metres:g} m between {first} and {second}"
+    return Similarity(metres / distance), f"by {metres:g} m between {first} and {second}"
 
 
 def _common_up(poses: Tensor, option: str) -> Tensor:
@@ -128,7 +122,7 @@ def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[Simil
     instead = "; use --metres A B DISTANCE"
     if cloud is None:
         raise DataError(f"--camera-height: there are no points to find the floor by{instead}")
-    level = rotation_to_z(_common_up(poses, "--camera-height"))
+    level = Similarity.turning(_common_up(poses, "--camera-height"), Z).rotation
     points, cameras = cloud.points.double() @ level.mT, centers(poses) @ level.mT
     points = points[points[:, 2] < cameras[:, 2].median()]
     points = points[points[:, 2].argsort(descending=True)]
@@ -156,7 +150,7 @@ def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[Simil
             f"--camera-height: the cameras' heights differ by {heights:.0%} (at most {_MAX_HEIGHTS:.0%}), so that not "
             f"all are {metres:g} m above one floor{instead}"
         )
-    return scaled(metres / height), f"by cameras {metres:g} m above the floor ({inside[best]} points)"
+    return Similarity(metres / height), f"by cameras {metres:g} m above the floor ({inside[best]} points)"
 
 
 def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
@@ -169,7 +163,7 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
             f"at least 3 are needed{instead}"
         )
     origin, truth = local_metres([place for _, place in found])
-    level = rotation_to_z(_common_up(poses, "--gps"))
+    level = Similarity.turning(_common_up(poses, "--gps"), Z).rotation
     used = centers(poses)[[k for k, _ in found]]
     at = used @ level.mT
     theirs, ours = (torch.complex(of[:, 0], of[:, 1]) for of in (truth, at))
@@ -194,13 +188,6 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
         f"by GPS of {len(found)} images, {residual:.2g} m from the fit; x is east, y north, z up from latitude, "
         f"longitude, altitude {where}"
     )
-
-
-def rotation_to_z(up: Tensor) -> Tensor:
-    """Return the smallest rotation [3, 3] that maps a direction [3] to +z."""
-    from scipy.spatial.transform import Rotation
-
-    return torch.from_numpy(Rotation.align_vectors([(0.0, 0.0, 1.0)], [up.tolist()])[0].as_matrix())
 
 
 def gps_of(image: Path) -> tuple[float, float, float] | None:

@@ -129,10 +129,7 @@ def solid_angle(lens: Pinhole) -> float:
 
 
 def looking_at(directions: Sequence[Sequence[float]] | Tensor) -> Tensor:
-    """Return rotations [K, 3, 3] (rows right, down, forward) of cameras without roll that look along directions [K, 3].
-
-    Directions must not be vertical.
-    """
+    """Return rotations [K, 3, 3] (rows right, down, forward) without roll that look along [K, 3], none vertical."""
     forward = torch.nn.functional.normalize(torch.as_tensor(directions, dtype=torch.float64), dim=-1)
     down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(forward)
     right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=-1)

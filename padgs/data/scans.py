@@ -41,9 +41,7 @@ def _check_header(path: Path) -> None:
         size, start, count = numbers("<HII", 94)
         extended, more = numbers("<QI", 235) if size >= 375 else (0, 0)
         fits = size + 54 * count <= start <= length and (not more or extended + 60 * more <= length)
-        if (
-            fits and numbers("<B", 104)[0] & 0x80
-        ):  # LAZ: the table of chunks is where the first number of the points says
+        if fits and numbers("<B", 104)[0] & 0x80:  # LAZ: the points begin with the place of the table of chunks
             table = numbers("<q", start)[0]
             table = numbers("<q", length - 8)[0] if table == -1 else table
             fits = start <= table <= length - 8 and numbers("<I", table + 4)[0] <= length

@@ -89,9 +89,8 @@ class ImageStore:
     def __init__(
         self, limit_bytes: int = 1 << 30, threads: int = 2, device: str = "cpu", folder: Path | None = None
     ) -> None:
-        """Keep at most `limit_bytes` of pixels on `device`, and all in `folder` if it is given.
-
-        `threads` = 0 disables prefetching.
+        """Keep `limit_bytes` of pixels on `device`, and all in `folder` if given; with `threads` = 0 nothing is
+        prefetched.
         """
         self.limit_bytes, self.threads, self.device, self.folder = limit_bytes, threads, device, folder
         self.bytes = 0

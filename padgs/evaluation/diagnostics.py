@@ -123,10 +123,7 @@ def pole_gap(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tenso
 
 
 def oracle(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor | None:
-    """Return the target [H, W, 3] blurred to the WS-PSNR of the image, by bisection; None if no blur has it.
-
-    There is no oracle for images better than the finest blur or worse than the coarsest.
-    """
+    """Return the target [H, W, 3] blurred to the WS-PSNR of the image, by bisection; None if no blur has it."""
     wanted = ws_psnr(image, target, mask)
     low, high = (math.log(sigma) for sigma in (SHARPEST * 2 * math.pi / target.shape[1], COARSEST))
     finest, coarsest = (ws_psnr(blurred(target, math.exp(end)), target, mask) for end in (low, high))

@@ -53,10 +53,7 @@ def evaluate(
 def score(
     image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol, notes: dict[str, None] | None = None
 ) -> Metrics:
-    """Return the metrics of one image [H, W, 3] against the truth, with a weight [H, W] per pixel or None.
-
-    If LPIPS is missing, the reason is added to `notes`.
-    """
+    """Return metrics of an image [H, W, 3] with a mask [H, W] or None; `notes` receives why LPIPS is missing."""
     rows = protocol.rows(image.shape[0])
     if protocol.solid_angle:
         mask = cropped_mask(mask, image, protocol)

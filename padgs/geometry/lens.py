@@ -39,10 +39,7 @@ def bend(directions: Tensor, axis: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
-    """Return the weight in [0, 1] of the lens along the axis [3] for directions [..., 3]; the other lens has the rest.
-
-    A smooth step over the band of `blend` radians on both sides of the plane between the lenses; hard for blend = 0.
-    """
+    """Return the weight in [0, 1] of the lens along the axis [3]: a smooth step over `blend` radians on both sides."""
     height = directions @ axis
     if blend == 0:
         return (height > 0).to(directions) + 0.5 * (height == 0).to(directions)

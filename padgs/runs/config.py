@@ -279,10 +279,7 @@ def scene_choices() -> dict[str, dict[str, Any]]:
 
 
 def choose_device(name: str, render: RenderConfig) -> torch.device:
-    """Return the device for `run.device`; auto is a GPU that can render these settings, else the CPU.
-
-    Warns if a GPU is not used because its library is missing or was not compiled for it.
-    """
+    """Return the device for `run.device`; auto: a GPU that can render these settings (else a warning), or the CPU."""
     if (name == "cuda" or render.backend == "cuda") and not torch.cuda.is_available():
         why = "torch finds no GPU with a working driver" if torch.version.cuda else "this torch is built without CUDA"
         wish, way_out = ("run.device", "cpu or auto") if name == "cuda" else ("render.backend", "auto, cpu or torch")

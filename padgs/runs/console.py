@@ -51,10 +51,7 @@ class Display:
     """A part of the console that is redrawn; its last content stays."""
 
     def __init__(self, console: Console, *, redraw: float, line: float, transient: bool = False) -> None:
-        """Redraw every `redraw` seconds in a terminal; print every `line` seconds elsewhere.
-
-        The last content is removed from a terminal if it is transient.
-        """
+        """Redraw every `redraw` seconds in a terminal, transient or not; print every `line` seconds elsewhere."""
         self._console = console
         live = Live(console=console, auto_refresh=False, transient=transient) if console.is_terminal else None
         self._live = live

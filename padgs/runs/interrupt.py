@@ -51,10 +51,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def ending_by_signals(advice: str = "") -> Iterator[None]:
-    """Answer signals; after one that stops, print a line with the advice and exit with 128 + its number.
-
-    If the reader of the output has ended, the program ends without a word.
-    """
+    """Answer signals: print the advice and exit with 128 + number, silently if the reader of the output has ended."""
     answer_signals()
     try:
         try:

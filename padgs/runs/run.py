@@ -117,10 +117,7 @@ def run(
 
 
 class _Outcome:
-    """Context of a training, in which failures become the status of `result`.
-
-    Other errors pass: an interrupt, and an image that cannot be read, which may be readable when the run is resumed.
-    """
+    """Context that turns failures of training into the status of `result`, but no interrupt and no unreadable image."""
 
     def __init__(self, result: Result, scene: Scene) -> None:
         self.result, self._scene = result, scene
@@ -156,10 +153,7 @@ def start(config: RunConfig) -> torch.device:
 
 
 def load_scene(config: RunConfig, device: torch.device) -> Scene:
-    """Load the scene of a run, and its decoded images, onto a device, under the run's stress.
-
-    A DataError or another ValueError says why the input, its stress or its number of views cannot be used.
-    """
+    """Load a run's scene and images onto a device, under its stress; a ValueError says what cannot be used."""
     scene = data.load(config.data.path, config.data.format, config.data.options(str(device)))
     scene = config.stress.apply(scene, config.seed).recentered().to(device)
     # Both refuse too few views, before hours of training.
@@ -267,10 +261,7 @@ def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]
 
 
 def judge(result: Result, scene: Scene, iterations: int) -> Result:
-    """Return the result with status diverged or degenerate if the scores of its test views say so.
-
-    Diverged: WS-PSNR below that of one constant colour. Degenerate: depth or thickness of surfaces are wrong.
-    """
+    """Return the result as diverged (worse than one colour) or degenerate (depth, thickness), if scores say so."""
     if not result.ok:
         return result
     metrics: dict[str, float | None] = {}

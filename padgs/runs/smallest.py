@@ -124,10 +124,7 @@ class Search:
         }
 
     def keep(self, epsilon: float) -> Result:
-        """Search, and keep the smallest model for a loss, refined on all training views, as a run beside RUN.
-
-        Returns the result of RUN, with what was found in `smallest`.
-        """
+        """Search, and keep the smallest model for a loss, refined, as a run beside RUN; return RUN's result."""
         self.complete()
         count = candidates.smallest(self.candidates, epsilon, self.shares).rows
         config = self._config(count, str(self.run.folder.resolve().parent), None)

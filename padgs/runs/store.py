@@ -173,10 +173,7 @@ class RunStore:
         checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint, self._run)
 
     def resume(self, method: Method, device: torch.device | str = "cpu") -> Progress:
-        """Load the checkpoint into a method, on a device; return its progress, or none without a checkpoint.
-
-        Log lines of later iterations are dropped, as those iterations come again; so is a line cut by a kill.
-        """
+        """Load the checkpoint, drop later log lines, and return the progress; None without a checkpoint."""
         progress = Progress()
         if self.has_checkpoint:
             state = checkpoint.load(self.checkpoint, device, self._run)

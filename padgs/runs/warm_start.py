@@ -57,9 +57,8 @@ class WarmStart:
             result = _finished(store)
             if checkpoint.digest(store.checkpoint) != self.checkpoint:
                 raise ConfigError(f"init={self.run} has changed since this run was composed; start it again")
-            if fingerprint != result.fingerprint and (
-                fingerprint_at(result.config["data"]["width"]) != result.fingerprint
-            ):
+            theirs = result.fingerprint
+            if theirs != fingerprint and theirs != fingerprint_at(result.config["data"]["width"]):
                 raise ConfigError(
                     f"init={self.run} was trained on other data: images, poses, points, split and masks must be the "
                     "same, only data.width may differ; take a run on this scene, or leave init out"

@@ -133,10 +133,7 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def center(self) -> None:
-        """Remove what all corrections have in common: to first order, a similarity of the whole world.
-
-        This keeps held-out views at their given places.
-        """
+        """Remove what corrections share, a similarity to first order; this keeps held-out views at their places."""
         rotations = self.given[:, :3, :3]
         beside = -(rotations.mT @ self.given[:, :3, 3:])[..., 0]
         beside = beside - beside.mean(0)  # camera centers, from their mean
@@ -202,10 +199,7 @@ class Corrections(nn.Module):
         if options.lens != GIVEN:
             for view in scene.train:
                 if not isinstance(view.camera, Panorama):
-                    kind = type(view.camera).__name__
-                    raise ValueError(
-                        f"train.lens is {options.lens}, but view {view.name!r} is a {kind}, not a Panorama; set given"
-                    )
+                    raise ValueError(f"train.lens is {options.lens}, but view {view.name!r} is no panorama; set given")
             first, axis = scene.train[0], options.lens.removeprefix(FISHEYES)
             is_map = options.lens == MAP
             self.lens = CameraMap(first.width, first.height) if is_map else DualLens(axis, scene_scale=scene.scale)

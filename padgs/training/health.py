@@ -88,10 +88,7 @@ class Monitor:
     """
 
     def __init__(self, iterations: int, count: int, pixels: int, *, active: bool = True) -> None:
-        """Begin a run with `count` Gaussians, anchors or other parts, and training views of `pixels`.
-
-        No run is ended unless the monitor is `active`.
-        """
+        """Begin a run with `count` parts of the model, and views of `pixels`; it ends none unless it is `active`."""
         self._iterations, self._pixels, self._active = iterations, pixels, active
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
         self._step: int | None = None  # schedule step of the iteration; None if both are the same
@@ -245,10 +242,7 @@ class EarlyStopping:
         return f"less than {GAIN} dB were gained within {PATIENCE:.0%} of the schedule"
 
     def _is_settled(self, psnr: float, count: int, step: int) -> bool:
-        """Add a measurement (dB) of a model with `count` parts; return whether the moving average has stopped gaining.
-
-        False while the number of parts changes: quality falls after growth and pruning before it rises.
-        """
+        """Add a measurement (dB) at a `count` of parts; return whether the moving average at this count stagnates."""
         span = round(PATIENCE / EVERY)
         averages, counts = self.state["averages"][-span:], [*self.state["counts"][-span:], count]
         averages = [*averages, averages[-1] + (psnr - averages[-1]) / span if averages else psnr]

@@ -22,10 +22,7 @@ def refuse_unusable(points: Tensor, what: str) -> None:
 
 
 def squared_spacing(points: Tensor) -> Tensor | None:
-    """Return the mean square distance [N] of each point [N, 3] to its three nearest others, float64 on the CPU.
-
-    None for a single point.
-    """
+    """Return the mean square distance [N] of points [N, 3] to the three nearest others, float64; None for one point."""
     from scipy.spatial import KDTree
 
     neighbours = min(NEIGHBOURS, len(points) - 1)

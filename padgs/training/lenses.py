@@ -112,10 +112,7 @@ class CameraMap(nn.Module):
 
     @torch.no_grad()
     def ideal_pixels(self) -> Tensor:
-        """Return the inverse: pixels (u, v) [H, W, 2] of the ideal panorama for each pixel of the image.
-
-        By fixed-point iteration, which converges if D is smooth and small (a few degrees).
-        """
+        """Return the ideal panorama's pixels (u, v) [H, W, 2] of each of the image's: the inverse, by iteration."""
         targets = normalize(self._rays, dim=-1)
         offsets, found = self._free_offsets(), targets
         for _ in range(INVERSE_STEPS):

@@ -82,9 +82,8 @@ class Trainer:
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
 
     def records(self) -> Iterator[Record]:
-        """Train to the end of the budget or to `Budget.max_seconds`, yielding a record after each iteration.
-
-        It raises a `Failure`: not finite (nan), out of memory (oom), nothing left to draw, or found by the `Monitor`.
+        """Train to the end of the budget, yielding a record per iteration; a `Failure` ends it: nan, oom or the
+        `Monitor`'s.
         """
         budget, limit = self._budget, self._budget.max_seconds
         while self.step < budget.iterations and (limit is None or self.seconds < limit):
@@ -115,10 +114,7 @@ class Trainer:
             yield Record(iteration, progress, loss, self.seconds, self.cpu_seconds, {**counts, **sizes}, events)
 
     def request_stop(self, reason: str) -> bool:
-        """Skip the schedule up to its final fade, between two records; return whether anything was skipped.
-
-        Events of skipped schedule steps, such as pruning, do not happen.
-        """
+        """Skip the schedule and its events up to the final fade, between two records; return whether any was left."""
         if self.step >= self._early_stopping.fade:
             return False
         self.skipped, self.step, self.ended = self._early_stopping.fade - self.step, self._early_stopping.fade, reason

@@ -42,11 +42,7 @@ class Method(ABC):
     RUN_RATES: ClassVar[str] = "run"  # law that `train.learning_rates=run` stands for
 
     def __init__(
-        self,
-        options: Any = None,
-        render: RenderConfig | None = None,
-        train: TrainOptions | None = None,
-        seed: int = 0,
+        self, options: Any = None, render: RenderConfig | None = None, train: TrainOptions | None = None, seed: int = 0
     ) -> None:
         """Check the options; those that can train on no scene are a ValueError."""
         self.options, self.seed = options or self.Options(), seed
@@ -252,10 +248,7 @@ class Method(ABC):
         return model
 
     def _schedule_length(self, scene: Scene, budget: Budget, lap: Lap) -> int:
-        """Return the schedule length for a budget of seconds since the start of `lap`, by some steps on one view.
-
-        All but the first find its image decoded.
-        """
+        """Return the schedule length for a budget of seconds since the start of `lap`, by some steps on one view."""
         assert budget.seconds is not None
         random, first = torch.get_rng_state(), 0.0
         short = Budget(PUBLISHED_ITERATIONS, clock=budget.clock)

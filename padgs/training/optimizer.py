@@ -50,10 +50,7 @@ def _change_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam, change
 
 
 def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collection[str]) -> None:
-    """Load the `state_dict` of another model, whose `growing` tensors may have another number of rows.
-
-    A ValueError names a tensor that is missing or has another shape.
-    """
+    """Load another model's `state_dict`, with other row counts if `growing`; a ValueError for other shapes."""
     count = len(tensors[first]) if (first := next(iter(growing))) in tensors else 0
     for name, own in model.state_dict().items():
         shape = [count, *own.shape[1:]] if name in growing else list(own.shape)
@@ -124,9 +121,8 @@ class Optimizer:
             self.refuse_non_finite({**parameters, **gradients}, iteration)
 
     def read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
-        """Return the loss as a number; on a GPU only every few iterations, because the host has to wait for it.
-
-        A Failure (nan) names a parameter or one of `inputs`.
+        """Return the loss, on a GPU only every few iterations, as the host waits; a Failure (nan) names what is not
+        finite.
         """
         if loss.device.type != "cpu" and iteration % READ_EVERY and not self.is_checked(iteration):
             return loss.detach()

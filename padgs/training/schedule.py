@@ -83,9 +83,8 @@ class Pace:
 
     @classmethod
     def of(cls, choice: str | float, iterations: int, schedule: int | None = None) -> Pace:
-        """Return the pace of a run of `iterations`: `published`, `run` or `run_linear`, or a factor.
-
-        A `schedule` that follows a clock has more steps than the run has iterations; None: as many.
+        """Return the pace of `iterations`: `published`, `run`, `run_linear` or a factor; a clock has more `schedule`
+        steps.
         """
         if choice in ("run", "run_linear"):
             is_linear = choice == "run_linear"

@@ -180,7 +180,7 @@ def test_both_lenses_add_to_one_positional_gradient():
 def test_only_panoramas_have_a_lens_to_learn(lens):
     pinhole = replace(VIEW, lens=Pinhole(32, 16, 10.0, 10.0, 16.0, 8.0))
     scene = replace(tiny_scene(), train=(VIEW, pinhole))
-    with pytest.raises(ValueError, match=f"train.lens is {lens}, but view .* is a Pinhole, not a Panorama; set given"):
+    with pytest.raises(ValueError, match=f"train.lens is {lens}, but view .* is no panorama; set given"):
         Corrections(scene, TrainOptions(lens=lens))
 
 

@@ -63,10 +63,7 @@ def device_ceilings(device: torch.device) -> Ceilings:
 
 
 def costs(size: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
-    """Return the least (operations, bytes) of the stages that have a cost model, from the counters of a size.
-
-    One lane of a vector instruction counts as 2 operations, because at the ceiling it would be a multiply-add.
-    """
+    """Return the least (operations, bytes) of stages with a cost model, by counters of a size; a multiply-add is 2."""
     model, counters, pixels = PaDGSOptions(), size["counters"], size["width"] * size["height"]
     anchors, gaussians, instances, pairs, scalars = (
         counters[name] for name in ("anchors", "gaussians", "instances", "evaluated", "parameters")

@@ -67,9 +67,7 @@ QUICK = BenchOptions(sizes=("quick",), repeats=3, ceiling_seconds=0.05)
 
 
 def measure_all(
-    options: BenchOptions,
-    progress: Callable[[str], None] = lambda _: None,
-    file: Path | None = None,
+    options: BenchOptions, progress: Callable[[str], None] = lambda _: None, file: Path | None = None
 ) -> dict[str, Any]:
     """Measure and return the report described above.
 

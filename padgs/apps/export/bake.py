@@ -37,10 +37,7 @@ DISTILLATION = TrainOptions()
 
 
 def sample_cameras(views: Sequence[View], count: int = VIEWS) -> list[View]:
-    """Return `count` cameras: at most half from the given views, the rest at random positions between them.
-
-    Deterministic. Positions between two views have the rotation of one of them, and no pixels.
-    """
+    """Return `count` cameras, always the same: at most half are given views, the rest lie between two of them."""
     random = torch.Generator().manual_seed(0)
     chosen = list(views[:: max(1, -(-len(views) // (count // 2)))])
     centers = torch.stack([view.center for view in views]).cpu()
@@ -105,10 +102,7 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
 
 
 def contributions(gaussians: Gaussians, view: View, options: RenderOptions, backend: str) -> Tensor:
-    """Return the sum of each Gaussian's blending weights over the pixels of a view, [N].
-
-    It is the derivative of the image's sum with respect to the Gaussian's colour.
-    """
+    """Return the sums [N] of blending weights over a view: the derivatives of the image's sum by the colours."""
     with torch.enable_grad():
         colors = gaussians.colors.detach().requires_grad_()
         drawn = render(replace(gaussians, colors=colors), view, options, backend=backend)
@@ -136,10 +130,7 @@ def distill(
     steps: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Train splats, in place, on renders of the training views of a scene by another model.
-
-    `config` is that of the student's renderer; `progress` is called with the number of completed steps.
-    """
+    """Train splats, in place, on another model's renders of training views; `config` is the student's renderer's."""
 
     def target(view: View) -> View:
         pixels = cache(lambda: (quantized(render_teacher(view).image) * 255).to(torch.uint8))

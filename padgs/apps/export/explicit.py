@@ -96,7 +96,7 @@ def export_run(
     start = _central_camera(scene.train, scene.scale)
     if upright:
         up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
-        rotation = upright_rotation(up)
+        rotation = Similarity.turning(up, UP)
         splats, start = transform_splats(splats, rotation), rotation(start)
         notes[notes.index(AXES)] = "units of the scene, rotated so that -y is up"
     return Exported(splats, tuple(notes), start)
@@ -133,7 +133,7 @@ def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None
     )
 
 
-DOWN = (0.0, 1.0, 0.0)  # in most viewers of 3DGS files, as in most structure from motion
+UP = (0.0, -1.0, 0.0)  # in most viewers of 3DGS files, as in most structure from motion
 
 
 @torch.no_grad()
@@ -171,11 +171,3 @@ def harmonics_rotation(rotation: Tensor, degree: int) -> Tensor:
     directions = torch.nn.functional.normalize(directions, dim=-1)
     old = harmonics.basis(directions @ rotation.double().cpu(), degree)  # R^T d, in the old world
     return torch.linalg.lstsq(harmonics.basis(directions, degree), old).solution.to(rotation)
-
-
-def upright_rotation(up: Tensor) -> Similarity:
-    """Return the smallest rotation that maps `up` [3] to the opposite of `DOWN`."""
-    from scipy.spatial.transform import Rotation
-
-    rotation = Rotation.align_vectors([-torch.tensor(DOWN).numpy()], [up.cpu().numpy()])[0]
-    return Similarity(1.0, torch.from_numpy(rotation.as_matrix()), torch.zeros(3, dtype=torch.float64))

@@ -92,7 +92,8 @@ class RunRenderer:
             rendering = self._method(full, options.crop).render(view)
             is_depth, scale = options.layer == "depth", self.run.scene.scale
             image = depth_image(rendering, scale) if is_depth else to_uint8(rendering.image)
-        return image if isinstance(lens, Pinhole) else _pad_to(image, max(2, round(resolution * height)))
+        rows = 0 if isinstance(lens, Pinhole) else max(2, round(resolution * height)) - len(image)
+        return np.pad(image, ((rows // 2, rows - rows // 2), (0, 0), (0, 0)))
 
     def nearest(self, cam_from_world: Tensor) -> View:
         """Return the view of the scene that is nearest to a pose."""
@@ -180,9 +181,3 @@ def with_legend(image: np.ndarray, layer: str, scale: float, gain: float) -> np.
 def side_by_side(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Join two images of one height, with a white line between them."""
     return np.concatenate((left, np.full_like(left[:, :2], 255), right), axis=1)
-
-
-def _pad_to(image: np.ndarray, height: int) -> np.ndarray:
-    """Pad an image with black rows to a height, centred."""
-    rows = height - len(image)
-    return np.pad(image, ((rows // 2, rows - rows // 2), (0, 0), (0, 0)))

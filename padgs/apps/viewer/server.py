@@ -67,10 +67,7 @@ def serve(
 
 @contextmanager
 def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
-    """Serve empty pages to any number of browsers, until the context ends; `LOCAL` serves this machine only.
-
-    `port` is the first port to try; the next free one is used.
-    """
+    """Serve empty pages until the context ends, at the first free port from `port`; `LOCAL`: this machine only."""
     viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
     port = free_port(host, port)
     with redirect_stdout(None), guard(token, is_local=local) as guarded:  # viser prints addresses even if not verbose

@@ -46,10 +46,7 @@ def image_pairs(
 
 
 def similarities(database: Path, images: Sequence[Sequence[str]], seed: int) -> np.ndarray:
-    """Return the similarity [n, n] of panoramas by the residuals of their features to the words of a vocabulary (VLAD).
-
-    It does not depend on where a panorama looks. `images` are the names of the images of each panorama.
-    """
+    """Return the similarity [n, n] of panoramas, wherever they look, by features' residuals to a vocabulary (VLAD)."""
     from scipy.cluster.vq import kmeans2, vq
 
     random = np.random.default_rng(seed)

@@ -24,7 +24,7 @@ from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
-from padgs.data.metres import UPRIGHT, moved, rotation_to_z, scaled, to_metres, write_unit
+from padgs.data.metres import UPRIGHT, Z, moved, to_metres, write_unit
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
@@ -40,6 +40,7 @@ from padgs.data.prepare.work import (
     refuse_full,
     threads_for,
 )
+from padgs.geometry.similarity import Similarity
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
 _REMEDIES = (
@@ -301,5 +302,5 @@ def level_world(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, .
     estimate = gravity(torch.stack([frame.cam_from_world for frame in frames]))
     if estimate.agreement < UPRIGHT:
         return frames, cloud, "the cameras have no common up direction; the world is not rotated"
-    change = scaled(1.0, rotation_to_z(torch.tensor(estimate.up, dtype=torch.float64)))
+    change = Similarity.turning(torch.tensor(estimate.up, dtype=torch.float64), Z)
     return *moved(frames, cloud, change), "the world's +z is the cameras' common up direction"

@@ -66,10 +66,7 @@ def extract_features(
 
 
 def _register(database: Path, groups: Sequence[Group]) -> list[int]:
-    """Add missing cameras and images to the database; returns the camera of each group.
-
-    pycolmap would add images in the order in which its threads finish, on which results depend.
-    """
+    """Add missing cameras and images in a fixed order, on which results depend; return the camera of each group."""
     pycolmap = pycolmap_module()
     cameras = []
     with pycolmap.Database.open(database) as entries:

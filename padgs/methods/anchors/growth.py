@@ -53,10 +53,7 @@ class GrowthOptions:
         check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_anchors")
 
     def for_run(self, iterations: int) -> GrowthOptions:
-        """Return the options for a run of another length: each window is the same share of the run as published.
-
-        The interval shrinks too, but not below `MIN_GROW_EVERY`, so short runs have fewer rounds.
-        """
+        """Return the options for another length, windows as shares of it; intervals are `MIN_GROW_EVERY` at least."""
         return replace(
             self,
             statistics_from=scaled(self.statistics_from, iterations),

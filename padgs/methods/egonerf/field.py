@@ -184,10 +184,7 @@ class EgoNeRF(nn.Module):
         return model.to(scene.points.device)
 
     def trace(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None = None) -> RayColors:
-        """Render rays from origins [B, 3], model units, along unit directions [B, 3]; differentiable by the parameters.
-
-        `generator` jitters the samples in training.
-        """
+        """Render rays from origins [B, 3], model units, along unit directions [B, 3]; `generator` jitters samples."""
         distances = self._sample(origins, directions, generator)
         at = self._at(origins, directions, distances)
         depths = self._optical_depths(self.density.factors(), at, distances)

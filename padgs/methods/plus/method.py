@@ -89,10 +89,7 @@ class PlusOptions(SplatOptions):
         return self.smoothness_weight * min(max(math.log2(2 * FEW_VIEWS / max(views, 1)), 0.0), 1.0)
 
     def dropout_share(self, pixels: float, gaussians: float) -> float:
-        """Return the dropped share for a number of training pixels in all views and a number of Gaussians.
-
-        0 with `AMPLE_PIXELS` per Gaussian, `dropout` with half as many, logarithmic between.
-        """
+        """Return the share dropped: 0 with `AMPLE_PIXELS` per Gaussian, `dropout` with half, logarithmic between."""
         if gaussians == 0:
             return 0.0
         return self.dropout * min(max(math.log2(AMPLE_PIXELS * gaussians / pixels), 0.0), 1.0)

@@ -71,12 +71,7 @@ class PruningStep:
     """Schedule of the one pruning by importance, a round after densification ends, at iteration `due` unless `done`."""
 
     def __init__(
-        self,
-        options: DensificationOptions,
-        iterations: int,
-        *,
-        requested: int | str | None,
-        prune_psnr: float | None,
+        self, options: DensificationOptions, iterations: int, *, requested: int | str | None, prune_psnr: float | None
     ) -> None:
         """Plan the step for a run of `iterations`, whose `options` are from `DensificationOptions.for_run`.
 

@@ -14,12 +14,7 @@ import torch
 from padgs.checks import check
 from padgs.geometry.harmonics import MAX_DEGREE
 from padgs.methods.splats.densification import DensificationOptions
-from padgs.methods.splats.depth_initialization import (
-    far_gaussians,
-    fill_sparse_cloud,
-    room_count,
-    solid_angle_pixels,
-)
+from padgs.methods.splats.depth_initialization import far_gaussians, fill_sparse_cloud, room_count, solid_angle_pixels
 from padgs.methods.splats.importance import GROWN_PER_KEPT
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
@@ -151,12 +146,7 @@ class SplatMethod(Method):
         return self._model_of(splats, values["extent"], values["iterations"])
 
     def _model_of(
-        self,
-        splats: Splats,
-        extent: float,
-        iterations: int,
-        views: Sequence[View] = (),
-        limit: int | None = None,
+        self, splats: Splats, extent: float, iterations: int, views: Sequence[View] = (), limit: int | None = None
     ) -> SplatModel:
         """Return the trainable model; `limit` is the maximal number of Gaussians."""
         options = self.options

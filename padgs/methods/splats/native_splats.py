@@ -42,10 +42,7 @@ class Evaluated(NamedTuple):
 
 
 def native_call(means: Tensor, center: Tensor) -> Call | None:
-    """Return the library call for float32 tensors on this device; None if torch has to evaluate the definition.
-
-    Cameras that learn (`center` requires a gradient) have no native derivative.
-    """
+    """Return the library's call for float32 tensors of a device; None if torch must do it, as cameras learn."""
     library = LIBRARIES.get(means.device.type)
     if library is None or means.dtype != torch.float32 or center.requires_grad or not library.works_on(means.device):
         return None

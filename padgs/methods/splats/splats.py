@@ -126,10 +126,7 @@ class Splats(nn.Module):
 
 
 def initial_scales(points: Tensor, scene_scale: float) -> Tensor:
-    """Return the RMS distance [N] of points [N, 3] to their three nearest neighbours, at least `MIN_INITIAL_SCALE`.
-
-    A single point gets a tenth of the scene scale.
-    """
+    """Return the RMS distance [N] of points to three neighbours, bounded below; 0.1 scene scales for a single one."""
     squared = squared_spacing(points)
     if squared is None:
         return points.new_full((len(points),), 0.1 * scene_scale)

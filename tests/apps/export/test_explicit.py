@@ -13,7 +13,7 @@ from support.tiny_scene import tiny_scene
 from typer.testing import CliRunner
 
 import padgs
-from padgs.apps.export.explicit import export_run, harmonics_rotation, transform_splats, upright_rotation
+from padgs.apps.export.explicit import UP, export_run, harmonics_rotation, transform_splats
 from padgs.apps.export.splat_file import read_splats
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
@@ -161,7 +161,7 @@ def test_turned_harmonics_are_the_function_turned(generator):
     assert torch.allclose(after, before, atol=1e-9)
 
 
-def test_upright_turns_up_against_down():
+def test_a_direction_is_turned_to_another_even_its_opposite():
     for up in ([0.0, 0.0, 1.0], [0.6, 0.0, -0.8], [0.0, 1.0, 0.0]):
-        rotated = upright_rotation(torch.tensor(up, dtype=torch.float64))(torch.tensor(up, dtype=torch.float64))
-        assert torch.allclose(rotated, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), atol=1e-9)
+        rotated = Similarity.turning(torch.tensor(up), UP)(torch.tensor(up, dtype=torch.float64))
+        assert torch.allclose(rotated, torch.tensor(UP, dtype=torch.float64), atol=1e-6)
