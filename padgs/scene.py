@@ -24,8 +24,7 @@ FAR = 1000.0  # largest distance of the cameras from the origin, in scene scales
 class View:
     """One image: its pose, its size, and functions that load its pixels. A panorama unless `lens` is given.
 
-    `load_pixels` and `load_mask` are called on every access; the loader decides what is cached. A view without
-    `load_pixels` can be rendered, but has no ground truth.
+    A panorama without `lens`. `load_pixels` (None: no ground truth) and `load_mask` run on every access, uncached.
     """
 
     name: str
@@ -134,8 +133,7 @@ class Scene:
     def scale(self) -> float:
         """Return the scene scale: the median distance from a training camera to a point, in world units.
 
-        Lengths in the configuration are multiples of it unless they say world units, so that training does not depend
-        on the scale of points and poses.
+        Lengths in the configuration are multiples of it unless said, so that training is independent of the scale.
         """
         points = self.points[:: max(1, len(self.points) // 20_000)].double()
         medians = [(points - view.center.double()).norm(dim=-1).median() for view in self.train]

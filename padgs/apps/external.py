@@ -272,8 +272,7 @@ def score_external(
 ) -> tuple[Result, Path]:
     """Score the test views of a scene, and write the result as that of a run; return it and its folder.
 
-    `config` is from `config_of`, with the options of the model; `label` is the name in tables; `program` is name and
-    version, empty if unknown; `runs` is the parent of the run folder.
+    `config` is from `config_of`; `label` names the row in tables, `program` name and version; `runs` is the parent.
     """
     name = re.sub(r"[^A-Za-z0-9]+", "-", label).strip("-")[:40].lower()
     if not name:

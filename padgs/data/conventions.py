@@ -39,8 +39,7 @@ class Convention(NamedTuple):
 def colour_fit(poses: Tensor, images: Tensor, points: Tensor, colors: Tensor) -> float:
     """Return the correlation of the colours of points [P, 3] and their pixels; 1 = equal, about 0 = unrelated.
 
-    `poses` are cam_from_world [F, 4, 4], `images` [F, H, W, 3] uint8 panoramas of a few hundred pixels width, `colors`
-    [P, 3] uint8.
+    `poses` are cam_from_world [F, 4, 4], `images` [F, H, W, 3] and `colors` [P, 3] uint8; few hundred pixels do.
     """
     found = _pixels(poses, images, points)
     colors = colors[:: max(1, len(points) // POINTS)].float().expand_as(found)
@@ -60,8 +59,7 @@ def _pixels(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
 def reprojection_errors(poses: Tensor, points: Tensor, tracks: Tracks, width: int, height: int) -> Tensor:
     """Return the reprojection errors [T] of points [P, 3] seen from poses [F, 4, 4], in pixels of width x height.
 
-    Errors wrap around the seam, and are scaled by the cosine of the latitude along rows, so that a pixel is the same
-    angle everywhere.
+    Errors wrap around the seam; along rows they are scaled by cos(latitude), so a pixel is one angle everywhere.
     """
     pose = poses.double()[tracks.frame]
     seen = (pose[:, :3, :3] @ points[tracks.point].double()[..., None])[..., 0] + pose[:, :3, 3]

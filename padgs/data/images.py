@@ -50,8 +50,7 @@ class ImageFile:
 def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
-    A DataError says why not: unreadable, truncated, rotated, of several pictures, 16-bit, grey, not 2:1, partly
-    transparent, or with colours that cannot be converted to sRGB.
+    Decodes only if the header is not enough. A DataError says why not: damage, rotation, depth, shape or colours.
     """
     data = read_bytes(path)
     with _opened(data, path) as image:

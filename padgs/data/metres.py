@@ -58,8 +58,7 @@ def moved(frames: Sequence[Frame], cloud: Cloud | None, new_from_old: Similarity
 def to_metres(frames: Sequence[Frame], cloud: Cloud | None, known: KnownLength) -> tuple[Similarity, str] | None:
     """Return the similarity that leads to a world in metres, and a note on the scale; None if no length is known.
 
-    With GPS, x is east, y north and z up, from the mean of the cameras' positions. A DataError says by which numbers
-    the scale does not follow from what is known.
+    With GPS: x east, y north, z up, from the mean position. A DataError says by which numbers there is no scale.
     """
     poses = torch.stack([frame.cam_from_world for frame in frames])
     if known.metres is not None:

@@ -29,8 +29,7 @@ def evaluate(
 ) -> Scores:
     """Render each test view and compare it with its ground truth; a Failure (nan) if a render is not finite.
 
-    `on_view` is called with each view, its truth and its render (clamped, 8-bit, not cropped), to save images; `extra`
-    computes further metrics of each view.
+    `on_view` receives each view, truth and render (8-bit, not cropped), to save images; `extra`: further metrics.
     """
     if not views:
         raise ValueError("no test views to evaluate; give the scene a test split")

@@ -76,8 +76,7 @@ def constant_color_quality(scene: Scene, protocol: Protocol) -> float:
 def probe(render: Render, view: View) -> dict[str, float]:
     """Return PSNR and polar transmittance of one test view during training.
 
-    The latter is the mean share of the background in rows beyond `POLAR` degrees of latitude (at least the first and
-    the last row), where modulated opacities may let it through.
+    The latter is the mean share of background beyond `POLAR` degrees, where modulated opacities may let it through.
     """
     rendering = render(view)
     image = rendering.image.clamp(0, 1)

@@ -18,8 +18,7 @@ OMEGA_AXES = ("camera_y", "world_z")
 def polar_axis(name: str, cam_from_world: Tensor) -> Tensor:
     """Return the polar axis [3] of latitudes, in the world frame, for a pose [4, 4].
 
-    camera_y is the polar axis of the panorama, as in the paper; world_z is that of the released code, which agrees only
-    if the z axis of the world is vertical and the camera is level.
+    camera_y is that of the panorama (paper), world_z of the released code: equal if the camera is level on z.
     """
     if name == "camera_y":
         return cam_from_world[1, :3]

@@ -28,8 +28,7 @@ def radial_map(theta: Tensor, coefficients: Tensor) -> Tensor:
 def bend(directions: Tensor, axis: Tensor, coefficients: Tensor) -> Tensor:
     """Turn directions [..., 3] away from the axis [3] by the radial map; the identity if all coefficients are 0.
 
-    d' = d cos(e) + t sin(e) with e = theta' - theta and t = (d cos(theta) - a) / sin(theta), the unit vector of growing
-    theta. On the axis e / sin(theta) goes to 0.
+    d' = d cos(e) + t sin(e), e = theta' - theta and t = (d cos(theta) - a) / sin(theta); on the axis e / sin = 0.
     """
     cosine = directions @ axis
     sine = torch.linalg.cross(directions, axis.expand_as(directions)).norm(dim=-1).clamp(min=1e-6)

@@ -147,8 +147,7 @@ def pad_panorama(image: Tensor, margin: int) -> Tensor:
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:
     """Return bilinear samples [..., C] of a panorama [H, W, C] at pixel coordinates, across the seam and the poles.
 
-    Differentiable by both. Samples have the dtype of the image, or float32 for integers. Pixels are continuous (u, v)
-    [..., 2]; u any number of turns around, v within the image.
+    Differentiable by both. Pixels are continuous (u, v) [..., 2]; u any number of turns, v within the image.
     """
     height, width = image.shape[:2]
     image = image if image.is_floating_point() else image.float()

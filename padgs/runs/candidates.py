@@ -125,8 +125,7 @@ def smallest_by_test(candidates: Sequence[Candidate], epsilon: float) -> Candida
 def next_count(candidates: Sequence[Candidate], losses: Sequence[float], shares: Shares) -> int | None:
     """Return the count of the next candidate; None if the smallest model of each loss is known.
 
-    Counts fall until the largest loss is exceeded. Then, for each loss, the interval between the smallest model and
-    the next smaller candidate is halved in log N.
+    They fall until the largest loss is exceeded; then log N is halved between smallest model and next candidate.
     """
     counts = [candidate.rows for candidate in candidates]
     down = math.ceil(STEP * min(counts))

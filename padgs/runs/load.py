@@ -63,8 +63,7 @@ class LoadedRun:
     def scene(self) -> Scene:
         """The scene that the run was trained on, loaded at first access.
 
-        Warns if the data have changed since: poses and units may differ from the model's. If they have moved, a
-        DataError says so, and `load_run(folder, data_path=...)` says where they are.
+        Warns if the data have changed since; a DataError if they have moved: give `load_run` their `data_path`.
         """
         scene = load_scene(self.config, choose_device(self.config.run.device, self.config.render))
         if difference := self._difference(scene):

@@ -54,8 +54,7 @@ class Tracker:
     ) -> None:
         """Import and connect nothing yet.
 
-        `runs` is the folder of run folders, `experiment` and `multirun` the names of the experiment and of the parent
-        run in mlflow (empty: DEFAULT_EXPERIMENT, and none); `say` shows a line to the user, at most once.
+        `experiment` and `multirun` (empty: none) are names in mlflow; `say` shows a line to the user, at most once.
         """
         self._runs, self.name = runs.absolute(), experiment or DEFAULT_EXPERIMENT
         self._uri = options.uri or f"sqlite:///{self._runs / 'mlflow.db'}"

@@ -52,8 +52,7 @@ class Difference:
 def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
     """Return the similarity first_from_second and its residuals for poses cam_from_world [F, 4, 4] float64.
 
-    The rotation comes from the orientations, because centres on a nearly straight path do not determine the rotation
-    about it. Scale and translation are least squares on the centres.
+    The rotation is from orientations (centres may lie on a line); scale and translation are least squares.
     """
     rotations = first[:, :3, :3].mT @ second[:, :3, :3]  # first_from_second as each camera sees it
     u, _, vh = torch.linalg.svd(rotations.sum(0))

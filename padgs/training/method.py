@@ -123,8 +123,7 @@ class Method(ABC):
     def warm_start(self, state: State) -> None:
         """Let `fit` begin with the model of another training on this scene instead of the point cloud.
 
-        Schedule, optimizer and densification statistics begin anew. View corrections are taken over if both trainings
-        learn them.
+        Schedule, optimizer and statistics begin anew; view corrections are taken over if both trainings learn them.
         """
         self._warm_start_state = state
 

@@ -84,8 +84,7 @@ class Record:
 class Model(Protocol):
     """A model in training: parameters, learning rates and densification.
 
-    `load_state` restores everything that `state` holds, sizes included; it may replace the data of the parameters that
-    `groups` returned, but not the parameters themselves.
+    `load_state` restores all of `state`, sizes included; it may replace the data of parameters, but not these.
     """
 
     def groups(self) -> list[ParameterGroup]:

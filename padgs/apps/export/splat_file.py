@@ -34,8 +34,7 @@ _NEEDED = (*_POSITION, *_COLOR, *_LAST)
 def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> None:
     """Write Gaussians to a .ply or a format of `CONVERTED`, chosen by the suffix; only active harmonics are written.
 
-    `comments` are lines of a PLY header, `start` [2, 3] the initial position and target of the viewer in an .html.
-    An existing file is replaced when the new one is complete.
+    `comments` are of a PLY header, `start` [2, 3] is the initial position and target of the viewer in an .html.
     """
     check_suffix(path)
     if not path.name.endswith(CONVERTED):

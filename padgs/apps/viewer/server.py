@@ -48,8 +48,7 @@ def serve(
 ) -> None:
     """Serve a page, print its address, and show runs until Ctrl-C; other arguments as in `start_server`.
 
-    `load_runs` returns one run, or two to compare; it is called while browsers load the page, because both take
-    seconds. `browse`: also open the page in a browser, if it is local.
+    `load_runs` is called while browsers load the page; `browse`: also open the page in a browser, if it is local.
     """
     with start_server(host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)

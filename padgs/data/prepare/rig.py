@@ -54,8 +54,7 @@ def render_views(
 ) -> None:
     """Write the twelve views of every panorama, all of one size, as <view>/<name>.png.
 
-    Their masks are written too, named as COLMAP requires: <view>/<name>.png.png. Panoramas without a mask are used
-    entirely.
+    Masks are named as COLMAP requires, <view>/<name>.png.png; panoramas without a mask are used entirely.
     """
     rotations = cam_from_pano()
     for done, (name, path) in enumerate(sorted(images.items())):

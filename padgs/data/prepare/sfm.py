@@ -173,8 +173,7 @@ def reconstruct(
 def refine(model: Any, threads: int) -> None:
     """Run a robust bundle adjustment, and drop points with large errors.
 
-    The mapper minimises squared errors; a Cauchy loss reduces the weight of wrong matches, which halves the largest
-    rotation errors on real panoramas.
+    A Cauchy loss reduces the weight of wrong matches; this halves the largest rotation errors of real panoramas.
     """
     pycolmap = pycolmap_module()
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)

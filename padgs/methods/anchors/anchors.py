@@ -199,8 +199,7 @@ def points_from_cells(cells: Tensor, size: float, dtype: torch.dtype = torch.flo
 def cell_keys(cells: Tensor) -> Tensor:
     """Return one int64 per row of cells [N, 3], [N]: equal exactly for equal rows, in lexicographic order.
 
-    A number with three digits, one per axis; or, if those exceed 64 bits (a far outlier in the cloud), the rank among
-    the distinct rows, which takes longer.
+    A number with three digits, one per axis; or the slower rank among distinct rows if those exceed 64 bits.
     """
     if len(cells) == 0:
         return cells.new_zeros(0)

@@ -105,8 +105,7 @@ class AnchorModel:
     def draw(self, view: View) -> AnchorRender:
         """Decode the anchors for the view and render them, differentiably.
 
-        On backend cuda the capacity of the last view spares waiting for the number of Gaussians, which is read while
-        they are rendered. If the capacity was too small, everything is repeated.
+        On cuda the last view's capacity spares waiting for the number of Gaussians; if too small, all is repeated.
         """
         ahead = resolve_backend(self._backend, self.anchors.positions) == "cuda"
         decoded = self.anchors.decode(view, (self._capacity if ahead else 0) or None)

@@ -26,8 +26,7 @@ CHUNK = 4096  # anchors in one part of a product that sums over anchors
 def decode_on_cpu(weights: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
     """Return means, quaternions, scales, opacities, colours, slots and raw opacities of the selected Gaussians.
 
-    `weights` are the twelve tensors of the networks, `tensors` the fields of `SeenAnchors`. Differentiable by weights,
-    features, offsets and log-scales.
+    `weights` are the networks' twelve tensors, `tensors` the fields of `SeenAnchors`; differentiable by all floats.
     """
     return _DecodeOnCPU.apply(*tensors, *weights)
 

@@ -288,8 +288,7 @@ def encoding(values: Tensor, frequencies: int) -> Tensor:
 class EnvironmentMap(nn.Module):
     """Colours by direction, bilinear, through a sigmoid; all texels cover the same solid angle.
 
-    Texel (i, j) of the H x 2H is centred at z = (2 i + 1) / H - 1 and azimuth = ((2 j + 1) / 2H - 1) pi; the
-    image is continuous across +-180 degrees.
+    Texel (i, j) of H x 2H is at z = (2 i + 1) / H - 1, azimuth ((2 j + 1) / 2H - 1) pi; continuous across the seam.
     """
 
     def __init__(self, height: int) -> None:

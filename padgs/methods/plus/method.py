@@ -110,8 +110,7 @@ class PlusOptions(SplatOptions):
     def for_run(self, iterations: int) -> DensificationOptions:
         """Return options with evenly spaced rounds up to `DENSIFIED_SHARE` of the run and no opacity resets.
 
-        Shorter runs than `LONG_RUN` have a threshold higher by the square root of the ratio: new Gaussians take
-        iterations to fit, and each makes every later iteration slower.
+        Below `LONG_RUN` the threshold grows by the root of the ratio: new Gaussians take iterations to fit.
         """
         every = iterations_per_round(iterations)
         names = (field.name for field in fields(DensificationOptions))

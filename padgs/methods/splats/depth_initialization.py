@@ -161,8 +161,7 @@ def _patch(rays: Tensor, pixel: float) -> Tensor:
 def far_gaussians(scene: Scene, count: int, *, degree: int, opacity: float) -> Splats:
     """Return far grey Gaussians in those of `count` even directions that no point covers, such as the sky.
 
-    Directions are seen from the median camera centre. Neighbouring Gaussians touch. A room whose cloud covers all
-    directions gets none.
+    Directions are seen from the median camera centre; neighbours touch. A room that covers all of them gets none.
     """
     from scipy.spatial import KDTree
 
@@ -194,8 +193,7 @@ def fibonacci_sphere(count: int) -> Tensor:
 def room_count(scene: Scene) -> float:
     """Return how many single rooms the points of a scene would fill, at least 1; several rooms are underestimated.
 
-    In a single room a view sees nearly all points. The inverse of the mean visible share over the training views is the
-    number of rooms.
+    In a single room a view sees nearly all points; rooms are the inverse of the mean share that a view sees.
     """
     points = scene.points[:: max(1, -(-len(scene.points) // ROOM_POINTS))].double()
     points = points[points.isfinite().all(1)]

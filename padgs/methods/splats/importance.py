@@ -50,8 +50,7 @@ def importance_scores(model: Prunable, views: Sequence[View]) -> Importance:
 def most_important(scores: Importance, count: int) -> Tensor:
     """Return the rows [count] with the largest `change`, in ascending order; ties go to the first.
 
-    The change of the renders ranks better than the change of their error: refinement changes the residual anyway, and
-    rows that do harm one by one are often needed together (docs/plus.md).
+    The change of renders ranks better than that of their error, which refinement changes anyway (docs/plus.md).
     """
     order = torch.argsort(scores.change, descending=True, stable=True)
     return order[:count].sort().values

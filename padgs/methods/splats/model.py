@@ -84,8 +84,7 @@ class SplatModel:
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians, differentiably.
 
-        `mean_offsets` are those of another render of the same Gaussians if a view is made of several renders: their
-        gradient is then the sum.
+        `mean_offsets` are those of another render of the same Gaussians: their gradient is then the sum of both.
         """
         splats, kind = self.splats, self.densifier.options.positional_gradient
         offsets = mean_offsets

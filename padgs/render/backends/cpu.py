@@ -41,8 +41,7 @@ class Strip:
 class Projected(native.Strips[Strip]):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
-    The number of (Gaussian, tile) instances is known before anything of that size is allocated. If it exceeds the
-    limit, the image is rendered in strips of tile rows.
+    The number of instances is known before anything is allocated; above the limit, strips of tile rows are drawn.
     """
 
     def __init__(self, camera: abi.NativeCamera, inputs: Inputs, max_instances: int) -> None:

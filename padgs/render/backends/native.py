@@ -73,8 +73,7 @@ class NativeImage(ABC):
     def rasterize(cls, request: Request) -> Rendering:
         """Render the request, differentiably.
 
-        OSError: the library was not built; RuntimeError: it was not compiled for this GPU. With too little GPU memory,
-        `options.max_instances` makes the strips smaller.
+        OSError: no library; RuntimeError: not compiled for this GPU. `options.max_instances` makes strips smaller.
         """
         leaves = Leaves(
             **vars(request.gaussians),
