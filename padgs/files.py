@@ -20,12 +20,7 @@ if TYPE_CHECKING:
 # Other decoders of Pillow run programs on what a file holds, such as Ghostscript, whatever the name of the file.
 IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 # First bytes of formats that Pillow does not know.
-_OTHER_FORMATS = {
-    b"ftyp": "HEIC, AVIF or a video",
-    b"%PDF": "PDF",
-    b"\0\0\0\x0cJXL": "JPEG XL",
-    b"<": "HTML, XML or SVG",
-}
+_OTHER_FORMATS = {b"ftyp": "HEIC, AVIF or video", b"%PDF": "PDF", b"\0\0\0\x0cJXL": "JPEG XL", b"<": "HTML, XML or SVG"}
 # Errors of Pillow
 DAMAGE = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, ArithmeticError, struct.error)
 MAX_PIXELS = 180_000_000  # a panorama of 18972x9486

@@ -18,7 +18,7 @@ from padgs import results
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
-from padgs.apps.frame_check import _closest_points, as_numbers, composed, read_transform, shifted
+from padgs.apps.frame_check import _closest_points, as_numbers, read_transform
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
@@ -129,8 +129,8 @@ def test_transforms_are_read_and_combined(tmp_path):
     for text in (as_numbers(MOVED), *(str(tmp_path / f"a.{kind}") for kind in ("npy", "json", "txt"))):
         assert torch.allclose(read_transform(text)(points), MOVED(points), atol=1e-5)
     assert torch.allclose(read_transform("identity")(points), points)
-    other = shifted(torch.tensor([1.0, 2, 3]))
-    assert torch.allclose(composed(MOVED, other)(points), MOVED(other(points)))
+    other = Similarity(translation=torch.tensor([1.0, 2, 3]).double())
+    assert torch.allclose((MOVED @ other)(points), MOVED(other(points)))
 
 
 @pytest.mark.parametrize(

@@ -27,16 +27,8 @@ MIN_WEIGHT = 1e-5  # added to every weight of a coarse sample, so that empty ray
 THREADS = 4  # grid_sample is parallel over its batch only, so channels are split into so many batch entries
 
 
-class ChartPosition(NamedTuple):
-    """Charts and places of directions."""
-
-    chart: Tensor  # [...] int64, YIN or YANG
-    polar: Tensor  # [...] in [0, 1] from the chart's polar angle pi/4 to 3 pi/4
-    azimuth: Tensor  # [...] in [0, 1] from -3 pi/4 to 3 pi/4
-
-
-def locate(points: Tensor) -> ChartPosition:
-    """Return chart and place of points [..., 3], whatever their length; the centre has an arbitrary place.
+def locate(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the chart (YIN or YANG) of points [..., 3], and where polar angle and azimuth lie in its span, in [0, 1].
 
     >>> chart, polar, azimuth = locate(torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     >>> chart.tolist(), polar.tolist(), azimuth.tolist()
@@ -47,11 +39,8 @@ def locate(points: Tensor) -> ChartPosition:
     other_polar, other_azimuth = _angles(swapped(points))
     polar = torch.where(inside, polar, other_polar)
     azimuth = torch.where(inside, azimuth, other_azimuth)
-    return ChartPosition(
-        torch.where(inside, YIN, YANG),
-        ((polar - math.pi / 2) / POLAR_SPAN + 0.5).clamp(0, 1),
-        (azimuth / AZIMUTH_SPAN + 0.5).clamp(0, 1),
-    )
+    place = ((polar - math.pi / 2) / POLAR_SPAN + 0.5).clamp(0, 1), (azimuth / AZIMUTH_SPAN + 0.5).clamp(0, 1)
+    return torch.where(inside, YIN, YANG), *place
 
 
 def swapped(points: Tensor) -> Tensor:
