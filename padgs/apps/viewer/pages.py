@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from padgs.apps.viewer import renders
@@ -130,7 +129,7 @@ class Page:
         world_from_cam = view.cam_from_world[:3, :3].mT.cpu().numpy()
         with self._client.atomic():
             self._client.camera.position = view.center.cpu().numpy()
-            self._client.camera.wxyz = np.roll(Rotation.from_matrix(world_from_cam).as_quat(), 1)
+            self._client.camera.wxyz = wxyz_of(world_from_cam)
 
     def state(self) -> PageState:
         """Return the state of controls and camera; a ValueError for values that the page does not offer."""
@@ -144,7 +143,7 @@ class Page:
         numbers = np.concatenate((camera.wxyz, camera.position, *(crop or ())))
         if not np.all(np.abs(numbers) < MAX_NUMBER) or not np.linalg.norm(camera.wxyz) > 1 / MAX_NUMBER:  # also NaN
             raise ValueError(f"camera and crop need a rotation and numbers below {MAX_NUMBER:g}; reload the page")
-        world_from_cam = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
+        world_from_cam = matrix_of(camera.wxyz)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width, height = sides(int(self._width.value), camera.aspect)
@@ -181,7 +180,7 @@ class Page:
             thickness=1.5,
             thickness_units="screen",
             color=(40, 120, 220),
-            wxyz=np.roll(Rotation.from_matrix(view.cam_from_world[:3, :3].mT.cpu().numpy()).as_quat(), 1),
+            wxyz=wxyz_of(view.cam_from_world[:3, :3].mT.cpu().numpy()),
             position=view.center.cpu().numpy(),
             visible=False,
         )
@@ -226,6 +225,20 @@ class Page:
                 text += f"; error of {state.renderers[0].nearest(state.cam_from_world).name}"
             self._summary.content = "  \n".join((*(renderer.summary for renderer in state.renderers), text))
         return seconds
+
+
+def wxyz_of(matrix: np.ndarray) -> np.ndarray:
+    """Return the quaternion [4] of a rotation [3, 3]."""
+    from viser.transforms import SO3
+
+    return SO3.from_matrix(matrix).wxyz
+
+
+def matrix_of(wxyz: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] of a quaternion [4]."""
+    from viser.transforms import SO3
+
+    return SO3(wxyz).as_matrix()
 
 
 def sides(longer: int, aspect: float) -> tuple[int, int]:

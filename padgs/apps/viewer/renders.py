@@ -80,7 +80,7 @@ class RunRenderer:
     ) -> np.ndarray:
         """Render an image [h, w, 3] uint8 from `cam_from_world` [4, 4]; panoramas are padded with black.
 
-        `width` and `height` are those at full resolution, of which `resolution` is a factor; low-pass filters stay.
+        `width` and `height` are those at full resolution, `resolution` a factor on them; low-pass filters stay or grow.
         """
         sizes = ((max(2, round(s * width)), max(2, round(s * height))) for s in (1.0, resolution))
         full, lens = (self._lens(options, *size) for size in sizes)
