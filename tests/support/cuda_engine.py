@@ -27,7 +27,6 @@ from padgs.render.leave_one_out import BACKENDS as SCORERS
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # deterministic; older torch reads it but once
 HERE = Path(__file__).parents[1] / "render" / "cuda"
 SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
-NVCC = shutil.which("nvcc")
 COMPILER = shutil.which("c++") or shutil.which("g++")
 FUSED = ("-mfma", "-ffp-contract=fast")
 FUSES = Path("/proc/cpuinfo").exists() and " fma " in Path("/proc/cpuinfo").read_text()
@@ -61,12 +60,6 @@ def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
     flags += ["-fno-gnu-unique"]  # or the emulations of two libraries would be one
     flags += ["-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"]  # of arrays: ends the process
     return _loaded(name, [str(COMPILER), *flags, *more, f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources)])
-
-
-def compiled_for_gpu(name: str, source: Path) -> ctypes.CDLL:
-    """Compile one source by nvcc for the GPU of this machine."""
-    flags = ["-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--expt-relaxed-constexpr", "-arch=native"]
-    return _loaded(name, [str(NVCC), *flags, f"-I{SOURCES}", "-x", "cu", str(source)])
 
 
 def _loaded(name: str, command: list[str]) -> ctypes.CDLL:

@@ -103,23 +103,6 @@ struct DeviceDecodeGradientArguments {
   float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K] or null: dL by the networks' outputs
 };
 
-// With networks, whose products are taken in a reduced type. The I inputs of an anchor are its features, then how it is
-// seen, in two tables; `input_rows` is not used.
-enum ReducedType : int32_t { kBfloat16 = 0, kFloat16 = 1 };
-struct NetworkInputs {
-  const float *features, *seen;  // [A, feature_count] [A, I - feature_count]
-  int32_t feature_count, type;
-};
-struct NetworkArguments {
-  DeviceDecodeArguments device;  // its logits are not used
-  NetworkInputs inputs;
-};
-struct NetworkGradientArguments {
-  DecodeGradientArguments gradient;  // weights_out: [padgs_cuda_networks_blocks], to be added up
-  NetworkInputs inputs;
-  int64_t room;  // there is no gradient of Gaussians behind it
-};
-
 struct DeviceSplatArguments {
   SplatArguments splats;  // its center is not used
   const float *center;    // [3]

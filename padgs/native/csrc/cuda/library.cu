@@ -25,10 +25,7 @@ PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
                           sizeof(DeviceLossArguments),
                           sizeof(DeviceSplatArguments),
                           sizeof(DeviceDecodeArguments),
-                          sizeof(DeviceDecodeGradientArguments),
-                          sizeof(NetworkInputs),
-                          sizeof(NetworkArguments),
-                          sizeof(NetworkGradientArguments)};
+                          sizeof(DeviceDecodeGradientArguments)};
   return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
 }
 
