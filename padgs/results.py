@@ -81,6 +81,8 @@ class Result:
     smallest: dict[str, Any] = field(default_factory=dict)  # see `padgs.runs.smallest.Search.front`
     # EXTERNAL -> text, if another program made the model or its renders (`padgs score`); the method is "external" then
     external: dict[str, str] = field(default_factory=dict)
+    # test view -> camera model (panorama, pinhole, opencv_fisheye, ...) if not all views are panoramas; else empty
+    cameras: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Reject a status that is not in STATUSES."""
@@ -204,8 +206,9 @@ def file_content(path: Path) -> bytes:
 def encoded(result: Result) -> dict[str, Any]:
     """Return a result as the document of its file: schema version, digest, and all fields."""
     content = _encode(asdict(result))
-    if not result.external:
-        del content["external"]
+    for name in ("external", "cameras"):  # only where they say something
+        if not content[name]:
+            del content[name]
     return {"schema": SCHEMA, "sha256": _digest(content), **content}
 
 
@@ -275,7 +278,8 @@ def _refuse_impossible(result: Result) -> None:
     if result.external.keys() - EXTERNAL or not all(isinstance(text, str) for text in result.external.values()):
         raise TypeError(f"external is {result.external!r}; it must be texts named {', '.join(EXTERNAL)}")
     views = (view for scores in result.scores.values() for view in scores.views)
-    for name in (*vars(result).values(), *result.external.values(), *views):
+    cameras = (*result.cameras, *result.cameras.values())
+    for name in (*vars(result).values(), *result.external.values(), *cameras, *views):
         if isinstance(name, str) and name != result.reason and len(name) > LONGEST_NAME:
             raise ValueError(f"{name[:20]}... has {len(name)} letters; names have at most {LONGEST_NAME}")
     for name in CONFIG_GROUPS & result.config.keys():

@@ -37,6 +37,7 @@ class View:
     load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] distance along the ray; 0, NaN = unknown, inf = sky
     depth_is_relative: bool = False  # inverse distances are known up to a scale and a shift; not scored
     share: float = 1.0  # of the passes over all training views in which this one is drawn
+    sphere_share: float = 1.0  # of all directions that a photograph beside panoramas shows; its weight among them
 
     @property
     def camera(self) -> Camera:
@@ -112,6 +113,11 @@ class Scene:
         )
         points, colors = self.points.to(device), self.point_colors.to(device)
         return replace(self, train=train, test=test, points=points, point_colors=colors)
+
+    @property
+    def panoramas(self) -> tuple[View, ...]:
+        """Return the training panoramas, or all training views if there are none."""
+        return tuple(view for view in self.train if view.lens is None) or self.train
 
     @cached_property
     def extent(self) -> float:

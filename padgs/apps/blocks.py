@@ -178,7 +178,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
     if destination.exists():
         raise DataError(f"{destination} exists; nothing is overwritten: remove it, or name another folder with --to")
     capture = padgs.data.read(source, format, options)
-    scene = assemble(capture, options)
+    scene = assemble(capture, replace(options, cameras="panoramas"))
     blocks = plan(capture, scene, count)
     assert capture.cloud is not None, "refused by plan"
     points, colors = capture.cloud.points, capture.cloud.colors

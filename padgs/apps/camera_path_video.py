@@ -65,7 +65,7 @@ def views_along(
     if path in PATHS:
         poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
     else:
-        up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
+        up = gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).up
         data_set = run.config.data
         try:
             poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))

@@ -145,6 +145,8 @@ class ExternalRun(LoadedRun):
             scene = load_scene(config, choose_device(device, render))
             if scene.origin.any() and program[0] != "padgs":  # whose exports are in the world of `scene`
                 splats = transform_splats(splats, Similarity(translation=-scene.origin.double().cpu()))
+        if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
+            raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
         config = replace(config, options=ExternalOptions(digest, transform))
         splats.scene_scale = scene.scale

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
-from padgs.evaluation.metrics import mean_color, ws_psnr
+from padgs.evaluation.metrics import mean_color, sphere_weight, ws_psnr
 from padgs.geometry.similarity import Similarity
 from padgs.render import Rendering
 from padgs.scene import Scene, View
@@ -131,7 +131,7 @@ def check_frame(
         ]
         return torch.stack(marks).mean().item()
 
-    flat = torch.stack([mean_color(truth, mask) for _, truth, mask in truths]).mean().item()
+    flat = torch.stack([mean_color(truth, sphere_weight(truth, mask)) for _, truth, mask in truths]).mean().item()
     found = FrameCheck(quality(Similarity()), flat)
     if found.psnr >= flat + MARGIN or not len(means):
         return found

@@ -16,8 +16,10 @@ from padgs.data.masks import find_masks, masks_beside
 from padgs.data.metres import unit_note
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage, cache_root
+from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
+MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 PREPARED = "prepare.json"  # written by `padgs.data.prepare`
 # Files that identify a prepared data set, and a run (see `padgs.results`). Searches for images skip such folders: they
@@ -27,35 +29,57 @@ SKIPPED = ((PREPARED,), ("config.yaml", "renders"))
 
 def assemble(capture: Capture, options: DataOptions) -> Scene:
     """Build the scene of a capture; a DataError if training cannot use it. Images are checked, but not decoded."""
-    capture = replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
+    # Panoramas first: the first view stands for all where only one is looked at.
+    frames = sorted(capture.frames, key=lambda frame: (frame.lens is not None, frame.name))
+    panoramas = sum(frame.lens is None for frame in frames)
+    left_out = options.cameras == "panoramas"
+    capture = replace(capture, frames=tuple(frames[:panoramas] if left_out else frames))
     names = [frame.name for frame in capture.frames]
     if not names:
         raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+    if not panoramas:
+        raise DataError(
+            f"all {len(frames)} images of {capture.folder} are of other cameras ({frames[0].name}), which can be used "
+            "beside panoramas (EQUIRECTANGULAR) only: reconstruct from the panoramas themselves (`padgs prepare`), or "
+            "give the sparse_equirectangular model"
+        )
     refuse_clashes(names)
     _refuse_missing(capture)
-    images = [inspect(frame.image) for frame in capture.frames]
+    images = [inspect(frame.image, panorama=frame.lens is None) for frame in capture.frames]
     notes = [*capture.notes, *unit_note(capture.folder), *_camera_notes(capture.frames, images), *notes_on(images)]
     target = options.width
     if target is None and capture.width is not None and images[0].width > capture.width:
         target = capture.width
-    sizes = [_view_size(image, target) for image in images]
-    reduced = {(image.width, image.height) for image, size in zip(images, sizes, strict=True) if size[0] < image.width}
+    factor = 1.0 if target is None else target / images[0].width
+    sizes = [
+        _view_size(image, target) if frame.lens is None else _reduced(image, factor)
+        for frame, image in zip(capture.frames, images, strict=True)
+    ]
+    whole = zip(images[:panoramas], sizes, strict=False)
+    reduced = {(image.width, image.height) for image, size in whole if size[0] < image.width}
     if reduced:
         stored = listed(f"{width}x{height}" for width, height in sorted(reduced))
         notes.append(f"images: reduced from {stored} to {target}x{sizes[0][1]} by an area filter")
-    unposed = _unposed(capture)
+    if panoramas < len(frames):
+        use = "left out (data.cameras=panoramas)" if left_out else "used, each by the share of the sphere that it shows"
+        notes.append(f"cameras: {len(frames) - panoramas} of {len(frames)} images are no panoramas; they are {use}")
+    unposed = _unposed(replace(capture, frames=tuple(frames)))
     if unposed:
         notes.append(f"{len(unposed)} images have no pose and are not used: {listed(unposed)}")
     rules = {"mode": options.split, "every": options.test_every, "stated": capture.split}
     split = split_frames(names, capture.folder, unposed=unposed, **rules)
+    if min(split.train) >= panoramas:
+        raise DataError("the train split holds no panorama, only photographs; name a panorama, or set data.split=every")
     points, colors, cloud_notes = initial_cloud(capture, options.points)
     folder, cache_notes = disk_cache(options, 3 * sum(width * height for width, height in sizes))
     store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device, folder)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = []
     for frame, size, mask in zip(capture.frames, sizes, masks, strict=True):
+        lens = frame.lens and frame.lens(*size)
         pixels = StoredImage(frame.image, *size, store)
-        views.append(View(view_name(frame.name), frame.cam_from_world, *size, pixels, mask, share=frame.share))
+        view = View(view_name(frame.name), frame.cam_from_world, *size, pixels, mask, lens, share=frame.share)
+        views.append(view if lens is None else replace(view, sphere_share=sphere_share(lens)))
     views, depth_digests, depth_notes = with_depths(views, capture, options)
     scene = Scene(
         name=capture.name or Path(os.path.abspath(capture.folder)).name,  # works for "." too; a link keeps its name
@@ -70,6 +94,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     for view, image in zip(views, images, strict=True):
         digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
         digest.update(view.cam_from_world.numpy().tobytes())
+        if view.lens is not None:
+            digest.update(view.lens.rays().numpy().tobytes())
     digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
     if any(view.share != 1 for view in views):
         digest.update(f"shares{[view.share for view in views]}".encode())
@@ -217,6 +243,13 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
             continue
+        if frame.lens is not None:
+            if abs(image.width / frame.width - image.height / frame.height) > 0.01:
+                raise DataError(
+                    f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}; make "
+                    "them agree"
+                )
+            continue
         if frame.width != 2 * frame.height or frame.width < 1:
             raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; a full panorama is 2:1")
         text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
@@ -225,6 +258,11 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
         differ = "; but ".join(list(scales.values())[:2])
         raise DataError(f"images and cameras disagree in size: {differ}; make them agree")
     return [f"images: {text}; used as they are" for scale, text in scales.items() if scale != 1]
+
+
+def _reduced(image: ImageFile, factor: float) -> tuple[int, int]:
+    """Return the size of a photograph beside panoramas that are reduced by a factor."""
+    return max(MIN_SIDE, round(factor * image.width)), max(MIN_SIDE, round(factor * image.height))
 
 
 def _view_size(image: ImageFile, width: int | None) -> tuple[int, int]:

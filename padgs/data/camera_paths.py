@@ -76,11 +76,11 @@ def interpolate_poses(poses: Tensor, times: Sequence[float] | np.ndarray) -> Ten
 
 
 def along_cameras(scene: Scene, frames: int) -> Tensor:
-    """Return a smooth path of constant speed through training cameras by name; a ValueError if they share a centre."""
+    """Return a smooth path of constant speed through training panoramas by name; a ValueError if centres are equal."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.spatial.transform import Rotation
 
-    views = sorted(scene.train, key=lambda view: natural_key(view.name))
+    views = sorted(scene.panoramas, key=lambda view: natural_key(view.name))
     given = torch.stack([view.cam_from_world for view in views])
     centers = torch.stack([view.center for view in views])
     steps = (centers[1:] - centers[:-1]).norm(dim=-1).cpu().numpy()
@@ -133,9 +133,9 @@ def look_along(centers: np.ndarray, directions: np.ndarray, up: np.ndarray) -> T
 
 def _frame(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean centre of the training cameras, up, and the level direction of their widest extent."""
-    poses = torch.stack([view.cam_from_world for view in scene.train]).double().cpu()
+    poses = torch.stack([view.cam_from_world for view in scene.panoramas]).double().cpu()
     up = np.array(gravity(poses).up)
-    centers = torch.stack([view.center for view in scene.train]).double().cpu().numpy()
+    centers = torch.stack([view.center for view in scene.panoramas]).double().cpu().numpy()
     middle = centers.mean(0)
     level = np.eye(3) - np.outer(up, up)
     forward = np.linalg.svd((centers - middle) @ level)[2][0]

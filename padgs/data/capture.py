@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Camera
+
 
 class DataError(ValueError):
     """Unusable input. The message names the file, the rule and the way out; no traceback is needed."""
@@ -54,7 +56,7 @@ def natural_key(name: str) -> tuple[list[Any], str]:
 
 @dataclass(frozen=True)
 class Frame:
-    """A posed panorama."""
+    """A posed panorama, or a photograph of another camera."""
 
     name: str  # path relative to the image folder, with its extension, "/" between folders
     image: Path
@@ -64,6 +66,7 @@ class Frame:
     mask: Path | None = None  # if the format names one
     depth: Path | None = None  # if the format names one
     share: float = 1.0  # of `padgs.scene.View`
+    lens: Callable[[int, int], Camera] | None = None  # camera of a photograph at a width and height; None: a panorama
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,10 @@ class Tracks:
 
     def thinned(self, count: int) -> Tracks:
         """Return about `count` observations, evenly spaced."""
-        some = slice(None, None, max(1, len(self.frame) // count))
+        return self.at(slice(None, None, max(1, len(self.frame) // count)))
+
+    def at(self, some: slice | Tensor) -> Tracks:
+        """Return some of the observations."""
         return Tracks(self.frame[some], self.point[some], self.pixels[some])
 
 
@@ -133,6 +139,7 @@ class Capture:
 
 
 SPLITS = ("auto", "files", "every", "all")
+CAMERAS = ("all", "panoramas")
 
 
 @dataclass(frozen=True)
@@ -145,6 +152,7 @@ class DataSettings:
     points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative to the data set's folder
     mask: str = "auto"  # auto | none | inverted (255 = ignore) | rows:959/1024 | [inverted:] a file or folder
     depth: str = "auto"  # auto: depth maps that the format names, or in depths/ with depth.json | none
+    cameras: str = "all"  # all | panoramas: leave out photographs of other cameras
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
     test_every: int = 8  # k of split=every
     cache_bytes: int = 1 << 30  # memory for decoded images of all views
@@ -157,6 +165,8 @@ class DataSettings:
             raise DataError(f"unknown data.split {self.split!r}; known: {', '.join(SPLITS)}")
         if self.depth not in ("auto", "none"):
             raise DataError(f"unknown data.depth {self.depth!r}; known: auto, none")
+        if self.cameras not in CAMERAS:
+            raise DataError(f"unknown data.cameras {self.cameras!r}; known: {', '.join(CAMERAS)}")
         if self.test_every < 2:
             raise DataError(f"data.test_every is {self.test_every}; every k-th view is a test view, with k at least 2")
         if self.width is not None and (self.width < 8 or self.width % 2):

@@ -114,6 +114,7 @@ def check(
         report.problems.append("all cameras have the same centre; depth cannot be learned")
     if damaged:  # the fit needs readable pixels
         return report
+    scene = replace(scene, train=scene.panoramas, test=tuple(view for view in scene.test if view.lens is None))
     _check_fit(capture, scene, report)
     if capture.cloud is not None:
         _check_depth(scene, report)
@@ -153,8 +154,10 @@ def _check_images(capture: Capture, report: Report, progress: Callable[[int, int
     for done, frame in enumerate(capture.frames):
         if frame.image.is_file():  # missing ones are reported together
             try:
-                inspect(frame.image)
-                refuse_dual_fisheye(decode(frame.image), frame.image)
+                inspect(frame.image, panorama=frame.lens is None)
+                pixels = decode(frame.image)
+                if frame.lens is None:
+                    refuse_dual_fisheye(pixels, frame.image)
             except DataError as error:
                 report.problems.append(str(error))
         progress(done + 1, len(capture.frames))
@@ -182,9 +185,9 @@ def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene |
 def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
     """Find test views that are identical or close to training views."""
     files = {frame.name.rpartition(".")[0]: frame.image for frame in capture.frames}
-    digests = {inspect(files[view.name]).digest: view.name for view in scene.train}
+    digests = {inspect(files[view.name], panorama=view.lens is None).digest: view.name for view in scene.train}
     for view in scene.test:
-        twin = digests.get(inspect(files[view.name]).digest)
+        twin = digests.get(inspect(files[view.name], panorama=view.lens is None).digest)
         if twin is not None:
             both = f"the test view {view.name} is the same image as the training view {twin}"
             report.problems.append(f"{both}; remove one of them")
@@ -204,7 +207,9 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     """Compare points with observations, else with colours, under the stated and other pose conventions."""
     conventions = known_conventions()
     tracks = None if capture.tracks is None or capture.cloud is None else capture.tracks()
-    sizes = {(frame.width, frame.height) for frame in capture.frames}
+    if tracks is not None:  # those of photographs are not compared
+        tracks = tracks.at(torch.tensor([frame.lens is None for frame in capture.frames])[tracks.frame])
+    sizes = {(frame.width, frame.height) for frame in capture.frames if frame.lens is None}
     width, height = next(iter(sizes))
     if tracks is not None and len(tracks.frame) and len(sizes) == 1 and width is not None and height is not None:
         assert capture.cloud is not None

@@ -47,10 +47,11 @@ class ImageFile:
     converted: bool = False  # whether other programs read other pixels, because the colours are not sRGB
 
 
-def inspect(path: Path, *, mask: bool = False) -> ImageFile:
+def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFile:
     """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
     Decodes only if the header is not enough. A DataError says why not: damage, rotation, depth, shape or colours.
+    Photographs of other cameras, and their masks, have any shape (`panorama` is false).
     """
     data = read_bytes(path)
     with _opened(data, path) as image:
@@ -60,7 +61,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
             refuse_several_pictures(image, path)
             mode, conversion = image.mode, None
             _refuse_other_modes(image, data, path, mask)
-            crop = crop_of(image, path)
+            crop = crop_of(image, path) if panorama else None
             if not mask:
                 conversion = srgb_conversion(image, data, path)
         except DAMAGE as error:
@@ -69,7 +70,8 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
             raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
         size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
         may_be_transparent = mode in _ALPHA or "transparency" in image.info
-    refuse_other_shapes(*size, path)
+    if panorama:
+        refuse_other_shapes(*size, path)
     if _looks_cut(data) or may_be_transparent:
         _decode(data, path, "L" if mask else "RGB")
     digest = hashlib.sha256(data).hexdigest()

@@ -103,7 +103,7 @@ def find_masks(
     inspected: dict[Path, ImageFile] = {}
     shown: dict[StoredImage | None, float] = {}  # share of the sphere
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
-        path, fixed = files.get(frame.name), rows.get(height)
+        path, fixed = files.get(frame.name), rows.get(height) if frame.lens is None else None
         if image.crop is not None:
             fixed = crop_weights(image.crop, width, height) * (1 if fixed is None else fixed)
             _refuse_hidden(fixed, f"the crop of {image.path} hides {{}}; remove that image")
@@ -111,7 +111,7 @@ def find_masks(
             masks.append(None if fixed is None else Mask(None, fixed))
             continue
         if path not in inspected:
-            inspected[path] = inspect(path, mask=True)
+            inspected[path] = inspect(path, mask=True, panorama=frame.lens is None)
         mask_file = inspected[path]
         if (mask_file.width, mask_file.height) not in ((image.width, image.height), (width, height)):
             raise DataError(
@@ -177,7 +177,9 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         usual += [capture.folder / name for name in MASK_FOLDERS if (capture.folder / name).is_dir()]
         given = next(iter(usual), capture.image_folder)
     if given.is_file():
-        return {frame.name: given for frame in capture.frames}, f"mask: {given.name} for every view"
+        panoramas = [frame.name for frame in capture.frames if frame.lens is None]
+        which = "every view" if len(panoramas) == len(capture.frames) else "every panorama"
+        return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}"
     beside, listings = given == capture.image_folder, {}
     found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside, listings))}
     if beside and not found:

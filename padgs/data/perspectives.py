@@ -77,11 +77,7 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
 
     `rotations` [K, 3, 3] lead from the panorama's camera frame to the views'; rows are right, down, forward.
     """
-    if not isinstance(panorama.camera, Panorama):
-        raise ValueError(
-            f"view {panorama.name!r} has a {type(panorama.camera).__name__} camera; only panoramas can be "
-            "resampled to perspective views"
-        )
+    _refuse_photographs(panorama)
     views, pixels, mask = [], panorama.load_pixels, panorama.load_mask
     for number, rotation in enumerate(rotations.double()):
         pose = panorama.cam_from_world.clone()
@@ -92,9 +88,19 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
     return tuple(views)
 
 
+def _refuse_photographs(*views: View) -> None:
+    for view in views:
+        if not isinstance(view.camera, Panorama):
+            raise ValueError(
+                f"view {view.name!r} has a {type(view.camera).__name__} camera; only panoramas can be resampled to "
+                "perspective views: leave out photographs with data.cameras=panoramas"
+            )
+
+
 def perspective_scene(scene: Scene, rotations: Tensor, lens: Callable[[Panorama], Pinhole]) -> Scene:
     """Replace each training panorama by perspective views that are not fully masked; test views remain panoramas."""
     views: list[View] = []
+    _refuse_photographs(*scene.test)
     for panorama in scene.train:
         cut = perspective_views(panorama, rotations, lens(Panorama(panorama.width, panorama.height)))
         views += [view for view in cut if _is_visible(view)]

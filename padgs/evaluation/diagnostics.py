@@ -33,8 +33,8 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # from ring to ring
 
 
 def depth_scores(view: View, rendering: Rendering, mask: Tensor | None = None) -> dict[str, float | None]:
-    """Return AbsRel and delta < 1.25 of the rendered depth, by solid angle; None without measured depth."""
-    if view.load_depth is None or view.depth_is_relative:
+    """Return AbsRel and delta < 1.25 of the depth of a panorama, by solid angle; None without measured depth."""
+    if view.load_depth is None or view.depth_is_relative or view.lens is not None:
         return {"abs_rel": None, "delta_1_25": None}
     depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
     if mask is not None:
@@ -95,17 +95,17 @@ def yaw_error(render: Callable[[View], Rendering], view: View, image: Tensor) ->
 
 
 def diagnose(render: Callable[[View], Rendering], view: View, rendering: Rendering) -> dict[str, float | None]:
-    """Return yaw and depth diagnostics of a rendering; None if the view has no ground truth for it."""
+    """Return yaw and depth diagnostics of a panorama; None if the view has no ground truth for it."""
     names = ("yaw_error", "depth_error", "depth_within", "floaters", "least_extent")
     metrics: dict[str, float | None] = dict.fromkeys(names)
-    if view.lens is None and view.width % 2 == 0:
+    if view.width % 2 == 0:
         metrics["yaw_error"] = yaw_error(render, view, rendering.image).item()
     if view.load_depth is not None and not view.depth_is_relative:
         depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
         metrics["depth_error"] = finite_or_none(depth_error(depth, truth))
         metrics["depth_within"] = finite_or_none(depth_within(depth, truth))
         metrics["floaters"] = finite_or_none(floaters(depth, 1 - rendering.transmittance, truth))
-        metrics["least_extent"] = finite_or_none(least_extent(depth, truth)) if view.lens is None else None
+        metrics["least_extent"] = finite_or_none(least_extent(depth, truth))
     return metrics
 
 

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from padgs.evaluation.lpips import LpipsUnavailable, lpips
-from padgs.evaluation.metrics import METRICS, sphere_weight
+from padgs.evaluation.metrics import METRICS, PHOTOGRAPH_METRICS, sphere_weight
 from padgs.evaluation.protocols import Protocol
+from padgs.geometry.camera import Camera, pixel_solid_angles
 from padgs.render import Rendering
 from padgs.results import Scores
 from padgs.scene import View
@@ -41,7 +42,7 @@ def evaluate(
             image = quantized(checked(rendering.image, view))
             truth = view.image(dtype=image.dtype, device=image.device)
             mask = view.mask(dtype=image.dtype, device=image.device)
-            metrics[view.name] = score(image, truth, mask, protocol, notes)
+            metrics[view.name] = score(image, truth, mask, protocol, notes, camera=view.lens)
             if extra is not None:
                 metrics[view.name] |= extra(view, rendering)
             if on_view is not None:
@@ -50,18 +51,36 @@ def evaluate(
 
 
 def score(
-    image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol, notes: dict[str, None] | None = None
+    image: Tensor,
+    truth: Tensor,
+    mask: Tensor | None,
+    protocol: Protocol,
+    notes: dict[str, None] | None = None,
+    *,
+    camera: Camera | None = None,
 ) -> Metrics:
-    """Return metrics of an image [H, W, 3] with a mask [H, W] or None; `notes` receives why LPIPS is missing."""
+    """Return metrics of an image [H, W, 3] with a mask [H, W] or None; `notes` receives why LPIPS is missing.
+
+    `camera` is that of a photograph, which is not cropped and has no metrics of latitudes and of a seam.
+    """
     rows = protocol.rows(image.shape[0])
-    if protocol.solid_angle:
+    if camera is not None:
+        pass
+    elif protocol.solid_angle:
         mask = cropped_mask(mask, image, protocol)
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
-    metrics: Metrics = {name: finite_or_none(METRICS[name](image, truth, mask)) for name in protocol.metrics}
+    weight = angle_weight(image, mask, camera)
+    metrics: Metrics = {}
+    for name in protocol.metrics:
+        if camera is None:
+            metrics[name] = finite_or_none(METRICS[name](image, truth, mask))
+        else:
+            measure, by_angle = PHOTOGRAPH_METRICS.get(name), name.startswith("ws_")
+            metrics[name] = measure and finite_or_none(measure(image, truth, weight if by_angle else mask))
     if protocol.lpips_name is not None:
         try:
-            weight = sphere_weight(image, mask) if protocol.solid_angle else None
+            weight = weight if protocol.solid_angle else None
             value = lpips(image, truth, mask, weight=weight, net=protocol.lpips, inputs=protocol.lpips_inputs)
             metrics[protocol.lpips_name] = finite_or_none(value)
         except LpipsUnavailable as reason:
@@ -69,6 +88,14 @@ def score(
             if notes is not None:
                 notes[f"{protocol.lpips_name} is missing: {reason}"] = None
     return metrics
+
+
+def angle_weight(image: Tensor, mask: Tensor | None, camera: Camera | None) -> Tensor:
+    """Return the solid angle of each pixel times its mask, [H, W], of a photograph's camera or a panorama (None)."""
+    if camera is None:
+        return sphere_weight(image, mask)
+    angles = (pixel_solid_angles(camera) * camera.focal**2).to(image)
+    return angles if mask is None else angles * mask
 
 
 def cropped_mask(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tensor | None:
@@ -87,8 +114,8 @@ def mean_metrics(views: Sequence[Metrics]) -> Metrics:
     {'psnr': 25.0, 'seam': None}
     """
     mean: Metrics = {}
-    for name in views[0]:
-        present = [value for metrics in views if (value := metrics[name]) is not None]
+    for name in dict.fromkeys(name for metrics in views for name in metrics):
+        present = [value for metrics in views if (value := metrics.get(name)) is not None]
         mean[name] = sum(present) / len(present) if present else None
     return mean
 

@@ -86,11 +86,10 @@ def seam(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     return weighted_mean(steps[:, :1], weight[:, :1]) / inside
 
 
-def mean_color(target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return `ws_psnr` of the target's mean colour: the score of a model that learned nothing."""
-    weight = sphere_weight(target, mask)
+def mean_color(target: Tensor, weight: Tensor) -> Tensor:
+    """Return the PSNR of the target's mean colour, both by weight [H, W]: the score of a model that learned nothing."""
     color = (target * weight[..., None]).sum((0, 1)) / weight.sum()
-    return ws_psnr(color.expand_as(target), target, mask)
+    return psnr(color.expand_as(target), target, weight)
 
 
 METRICS: dict[str, Metric] = {
@@ -101,6 +100,8 @@ METRICS: dict[str, Metric] = {
     **{f"ws_psnr_{band}": partial(band_ws_psnr, band=band) for band in BANDS},
     "seam": seam,
 }
+# Of photographs; metrics by solid angle take it as a mask, and those of latitudes and of a seam are missing.
+PHOTOGRAPH_METRICS: dict[str, Metric] = {"psnr": psnr, "ssim": ssim, "ws_psnr": psnr, "ws_ssim": ssim}
 
 
 def sphere_weight(image: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -9,8 +9,16 @@ from typing import Any
 
 from padgs.clock import timed
 from padgs.evaluation.diagnostics import depth_scores, diagnose, oracle, pole_gap
-from padgs.evaluation.evaluate import Metrics, OnView, cropped_mask, evaluate, finite_or_none, quantized
-from padgs.evaluation.metrics import mean_color, psnr, ws_psnr_fitted
+from padgs.evaluation.evaluate import (
+    Metrics,
+    OnView,
+    angle_weight,
+    cropped_mask,
+    evaluate,
+    finite_or_none,
+    quantized,
+)
+from padgs.evaluation.metrics import mean_color, psnr, sphere_weight, ws_psnr_fitted
 from padgs.evaluation.protocols import Protocol
 from padgs.geometry.panorama import row_latitudes
 from padgs.render import Rendering
@@ -49,10 +57,13 @@ def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView
     """Return image metrics, diagnostics, and WS-PSNR of one colour, after fitting colours, and of training views."""
 
     def more(view: View, rendering: Rendering) -> Metrics:
+        if view.lens is not None:
+            return {}
         truth, image = view.image(device=rendering.image.device), quantized(rendering.image)
         mask = cropped_mask(view.mask(device=image.device), image, protocol)
-        marks = {"ws_psnr_one_color": mean_color(truth, mask), "ws_psnr_fitted": ws_psnr_fitted(image, truth, mask)}
-        if view.lens is None and (blurred := oracle(image, truth, mask)) is not None:
+        one_color = mean_color(truth, sphere_weight(truth, mask))
+        marks = {"ws_psnr_one_color": one_color, "ws_psnr_fitted": ws_psnr_fitted(image, truth, mask)}
+        if (blurred := oracle(image, truth, mask)) is not None:
             marks["pole_gap_oracle"] = pole_gap(blurred, truth, mask)
         marks = {"pole_gap_oracle": None, **{name: finite_or_none(mark) for name, mark in marks.items()}}
         return {**marks, **diagnose(render, view, rendering)}
@@ -67,8 +78,9 @@ def constant_color_quality(scene: Scene, protocol: Protocol) -> float:
     """Return the mean WS-PSNR (dB) of test views that are replaced by their mean colour."""
 
     def quality(view: View) -> float:
-        truth = view.image()
-        return mean_color(truth, cropped_mask(view.mask(), truth, protocol)).item()
+        truth, mask = view.image(), view.mask()
+        mask = mask if view.lens is not None else cropped_mask(mask, truth, protocol)
+        return mean_color(truth, angle_weight(truth, mask, view.lens)).item()
 
     return sum(map(quality, scene.test)) / len(scene.test)
 

@@ -6,6 +6,7 @@ and pinholes are equal if their numbers are.
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ class Panorama:
 
     width: int
     height: int
+    kind: ClassVar[str] = "panorama"
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Return unit directions [H, W, 3] through the pixel centres."""
@@ -40,6 +42,7 @@ class Pinhole:
     fy: float
     cx: float
     cy: float
+    kind: ClassVar[str] = "pinhole"
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Return unit directions [H, W, 3] through the pixel centres."""
@@ -71,6 +74,7 @@ class RayTable:
 
     table: Tensor  # [H, W, 3] unit, camera frame
     focal: float  # pixels per radian, for low-pass filters given in pixels
+    kind: str = "rays"  # name of the camera model
 
     @property
     def width(self) -> int:
@@ -88,3 +92,19 @@ class RayTable:
 
 
 Camera = Panorama | Pinhole | RayTable
+
+
+def pixel_solid_angles(camera: Camera) -> Tensor:
+    """Return the solid angle [H, W] float64 of each pixel in steradians, by differences of rays; at least 3x3 pixels.
+
+    >>> round(pixel_solid_angles(perspective(100, 100, 90.0)).sum().item() / (4 * math.pi), 4)  # a face of a cube
+    0.1667
+    """
+    table = camera.rays(dtype=torch.float64)
+    down, across = (torch.gradient(table, dim=dim, edge_order=2)[0] for dim in (0, 1))
+    return torch.linalg.cross(across, down).norm(dim=-1)
+
+
+def sphere_share(camera: Camera) -> float:
+    """Return the share of all directions that a camera sees."""
+    return min(1.0, pixel_solid_angles(camera).sum().item() / (4 * math.pi))

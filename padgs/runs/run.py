@@ -210,6 +210,7 @@ def _final(config: RunConfig, result: Result, progress: Progress) -> Result:
 def initial_result(config: RunConfig, scene: Scene, run: str) -> Result:
     """Return the result of a run before its first iteration, with status ok."""
     view = (scene.test or scene.train)[0]
+    is_panoramic = all(view.lens is None for view in (*scene.train, *scene.test))
     machine = clock.machine(scene.points.device)
     code = (machine["padgs"], (machine["commit"] or "")[:10], distribution(config.method))
     values = config.values()
@@ -230,6 +231,7 @@ def initial_result(config: RunConfig, scene: Scene, run: str) -> Result:
         machine=machine,
         config_hash=config_hash(values),
         fingerprint=scene.fingerprint,
+        cameras={} if is_panoramic else {view.name: view.camera.kind for view in scene.test},
         finished="",
         config=values,
         experiments=config.labels.experiments,
@@ -239,8 +241,9 @@ def initial_result(config: RunConfig, scene: Scene, run: str) -> Result:
 def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, method: Method) -> float | None:
     """Log an iteration if that is due; return the PSNR of the held-out view if it was measured."""
     last = record.progress == 1
-    due = bool(scene.test) and (last or record.iteration % config.run.probe_every == 0)
-    probed = probe(method.render, scene.test[len(scene.test) // 2]) if due else {}
+    panoramas = [view for view in scene.test if view.lens is None]
+    due = bool(panoramas) and (last or record.iteration % config.run.probe_every == 0)
+    probed = probe(method.render, panoramas[len(panoramas) // 2]) if due else {}
     if last or due or record.events or record.iteration % config.run.log_every == 0:
         store.log(record, probed)
     return probed.get("psnr")

@@ -56,9 +56,9 @@ class Trainer:
     ) -> None:
         """Prepare; nothing is rendered yet.
 
-        `views_each` are the views per iteration: Adam steps on the sum of their losses. Views are smaller in
-        `coarse_share` of the run, see `padgs.training.targets.Targets`. `stage` is entered with the name of each part
-        of an iteration, for timing.
+        `views_each` are the panoramas per iteration, or photographs that show as much: Adam steps on the sum of their
+        losses, each weighted by the share of the sphere that it shows. Views are smaller in `coarse_share` of the run,
+        see `padgs.training.targets.Targets`. `stage` is entered with the name of each part of an iteration, for timing.
         """
         self.iteration = self.step = self.skipped = 0
         self.ended = ""
@@ -131,9 +131,11 @@ class Trainer:
         """Render the next views and go back to the gradients; return mean loss and further counts."""
         model, optimizer, stage, options = self._model, self._optimizer, self._stage, self._options
         checked, losses, drawn = optimizer.is_checked(iteration), [], []
-        for _ in range(self._views_each):
+        room = float(self._views_each)
+        while not drawn or self._views.fits(room):
             with stage("target"):
                 index, view, target = self._views.next(step / self.schedule)
+            room -= view.sphere_share
             with stage("draw"):
                 rendered = self.corrections.renderer(model)(view)
                 image = self.corrections.exposed(rendered.rendering.image, index)
@@ -147,6 +149,7 @@ class Trainer:
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
                 # Not read before: squared errors that set in are no divergence.
                 loss = loss + target.squares(image, options, step / self.schedule)
+                loss = loss if view.sphere_share == 1 else view.sphere_share * loss
             if checked:
                 self._monitor.render(rendered, target.image, iteration)
             with stage("backward"):

@@ -88,6 +88,7 @@ class Method(ABC):
                 f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
                 f"scale to carry held-out views by; set train.poses={LEARNED} or {GIVEN}"
             )
+        self._refuse_photographs(scene)
         self.refuse_budget(budget)
         if self.train_options.refine and self._warm_start_state is None and self._loaded_state is None:
             raise ValueError("train.refine refines the model of a finished run; set init=RUN, or train.refine=false")
@@ -221,6 +222,19 @@ class Method(ABC):
         check_camera(Panorama(8, 4), self.render_config.options(scene_scale=1.0))
         if self.train_options.lens.startswith(FISHEYES):
             check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_scale=1.0))
+
+    def _refuse_photographs(self, scene: Scene) -> None:
+        """Refuse photographs beside the panoramas of a scene if the renderer draws panoramas only."""
+        if scene.train[0].lens is not None:  # views that are cut from panoramas
+            return
+        for view in (*scene.train, *scene.test):
+            try:
+                check_camera(view.camera, self.render_config.options(scene_scale=1.0))
+            except ValueError as error:
+                raise ValueError(
+                    f"{view.name} is a photograph beside panoramas: {error}; or leave out photographs with "
+                    "data.cameras=panoramas"
+                ) from error
 
     @property
     def _views_learn(self) -> bool:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from padgs.geometry.camera import Panorama
+from padgs.geometry.camera import Panorama, pixel_solid_angles
 from padgs.scene import Scene, View
 from padgs.training.loss import (
     MEASURED,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from padgs.training.options import TrainOptions
 
 CACHE_BYTES = 1 << 29  # weights of views beyond this are computed again at every iteration
+SLACK = 0.01  # of the sphere, by which photographs may show more than a panorama in one iteration
 MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
 
 
@@ -116,13 +117,19 @@ def depth_of(view: View, device: torch.device | str = "cpu") -> Tensor | None:
 
 
 def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
-    """Return the weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is in `ROW_WEIGHTS`."""
-    mask = view.mask(device=device)
+    """Return the weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is in `ROW_WEIGHTS`.
+
+    For other cameras than panoramas, solid_angle is that of each pixel, at most about 1, and all others are uniform.
+    """
+    mask, is_panorama = view.mask(device=device), isinstance(view.camera, Panorama)
     mask = None if mask is None else _checked_size(view, "mask", mask)
     try:
-        return pixel_weight(weight, view.height, mask, device=device)
+        rows = pixel_weight(weight if is_panorama else "uniform", view.height, mask, device=device)
     except ValueError as error:
         raise ValueError(f"view {view.name!r}: {error}") from error
+    if is_panorama or weight != "solid_angle":
+        return rows
+    return rows * (pixel_solid_angles(view.camera) * view.camera.focal**2).to(rows)
 
 
 def even_weight(view: View, device: torch.device) -> Tensor:
@@ -172,7 +179,8 @@ def halved(view: View) -> View:
 class TrainingViews:
     """The training views of a scene with their targets, one after the other, in random order without replacement.
 
-    A view with a `share` below 1 is left out of as many passes, at random.
+    A view with a `share` below 1 is left out of as many passes, at random. Photographs follow each other, so that
+    as many as show the whole sphere make one iteration.
     """
 
     def __init__(
@@ -206,6 +214,11 @@ class TrainingViews:
         self._scene.train[upcoming].prefetch()
         return index, *self.targets.at(index, progress)
 
+    def fits(self, room: float) -> bool:
+        """Return whether the next view shows at most `room`, a multiple of the sphere."""
+        ended = self._position == len(self._order)
+        return (1.0 if ended else self._scene.train[int(self._order[self._position])].sphere_share) < room + SLACK
+
     def include_held_out(self) -> None:
         """Include the views held out in the rest of this epoch, in random order, and in those after it."""
         if self._held_out:
@@ -219,12 +232,28 @@ class TrainingViews:
         indices = [index for index in range(len(self._scene.train)) if index not in self._held_out]
         order = torch.tensor(indices)[torch.randperm(len(indices), generator=self._generator)]
         shares = torch.tensor([self._scene.train[index].share for index in order.tolist()])
-        if (shares == 1).all():
-            return order
-        drawn = torch.tensor([False])
-        while not drawn.any():
-            drawn = torch.rand(len(order), generator=self._generator) < shares
-        return order[drawn]
+        if not (shares == 1).all():
+            drawn = torch.tensor([False])
+            while not drawn.any():
+                drawn = torch.rand(len(order), generator=self._generator) < shares
+            order = order[drawn]
+        return self._with_spheres_of_photographs(order)
+
+    def _with_spheres_of_photographs(self, order: Tensor) -> Tensor:
+        """Return the order with photographs together that show about the whole sphere, for one iteration."""
+        groups: list[list[int]] = []
+        room = 0.0
+        for index in order.tolist():
+            share = self._scene.train[index].sphere_share
+            if share == 1:
+                groups.append([index])
+                continue
+            if share > room + SLACK:
+                groups.append(together := [])
+                room = 1.0
+            together.append(index)
+            room -= share
+        return torch.tensor([index for group in groups for index in group])
 
     def state(self) -> State:
         """Return all that decides the views to come; not copies."""

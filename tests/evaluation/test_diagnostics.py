@@ -16,7 +16,7 @@ from padgs.evaluation.diagnostics import (
     pole_gap,
     yaw_error,
 )
-from padgs.evaluation.metrics import mean_color, ws_psnr
+from padgs.evaluation.metrics import mean_color, sphere_weight, ws_psnr
 from padgs.geometry.distortion import solid_angle_weight
 from padgs.geometry.panorama import rays, row_latitudes, sample
 from padgs.render import Rendering, RenderOptions, render
@@ -88,10 +88,10 @@ def test_diagnostics_without_ground_truth_are_missing():
 def test_mean_color_is_weighted_by_solid_angle():
     target = torch.zeros(16, 32, 3)
     target[:8] = 1.0
-    assert mean_color(target).item() == pytest.approx(-10 * math.log10(0.25))
+    assert mean_color(target, sphere_weight(target)).item() == pytest.approx(-10 * math.log10(0.25))
     mask = torch.zeros(16, 32)
     mask[:8] = 1
-    assert mean_color(target, mask) > 100
+    assert mean_color(target, sphere_weight(target, mask)) > 100
 
 
 def detail(pole: float, equator: float = 0.2) -> torch.Tensor:

@@ -14,6 +14,7 @@ from padgs.evaluation.metrics import (
     mean_color,
     psnr,
     seam,
+    sphere_weight,
     ssim,
     ws_psnr,
     ws_psnr_fitted,
@@ -115,7 +116,7 @@ def test_color_fit_removes_only_exposure_and_white_balance(pair, generator):
         errors.append(np.average((line(seen) - true) ** 2, weights=weight))
     assert fitted.item() == pytest.approx(-10 * math.log10(np.mean(errors)))
     flat = torch.full_like(target, 0.3)
-    torch.testing.assert_close(ws_psnr_fitted(flat, target), mean_color(target))
+    torch.testing.assert_close(ws_psnr_fitted(flat, target), mean_color(target, sphere_weight(target)))
     hidden = ones()
     hidden[:, ::2] = 0
     spoilt = torch.where(hidden[..., None] > 0, image, torch.rand(H, W, 3, generator=generator, dtype=torch.float64))

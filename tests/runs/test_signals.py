@@ -168,7 +168,7 @@ def test_pycolmap_leaves_the_handler_of_sigterm(root):
         "import os, signal\n"
         "from padgs.runs.interrupt import ending_by_signals\n"
         "with ending_by_signals():\n"
-        "    from padgs.data.formats.colmap import pycolmap_module\n"
+        "    from padgs.data.formats.colmap_lens import pycolmap_module\n"
         "    pycolmap_module()\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
     )

@@ -94,7 +94,7 @@ class Page:
         if may_stop and any(renderer.run.result is None for renderer in renderers):
             gui.add_button("stop and score", hint="end training now").on_click(lambda _: self._confirm_stop())
         folder, can_crop = renderers[0].run.folder, all(renderer.can_crop for renderer in renderers)
-        poses = torch.stack([view.cam_from_world for view in scene.train])
+        poses = torch.stack([view.cam_from_world for view in scene.panoramas])
         self._up = torch.tensor(gravity(poses).up, dtype=torch.float64)
         model = getattr(renderers[0].run, "file", folder)  # as commands name it
         self._crop = CropControls(client, box, model, can_crop, self.redraw)
@@ -264,10 +264,10 @@ def show_runs(server: Server, runs: Sequence[LoadedRun]) -> Iterator[dict[int, P
     # A browser was closed while rendering; or values have a wrong type.
     warnings.filterwarnings("ignore", message=r"Queued .* on a closed connection|\[viser\]")
     renderers, scene, viser = [RunRenderer(run) for run in runs], runs[0].scene, server.viser
-    up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
+    up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).up)
     viser.scene.set_up_direction(up)
     viser.gui.set_panel_label(f"padgs: {scene.name}")
-    first = scene.train[len(scene.train) // 2]
+    first = scene.panoramas[len(scene.panoramas) // 2]
     center = first.center.cpu().numpy()
     target = center + 0.3 * scene.scale * first.cam_from_world[2, :3].cpu().numpy()
     viser.initial_camera.position, viser.initial_camera.look_at, viser.initial_camera.up = center, target, up

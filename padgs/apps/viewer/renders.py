@@ -95,9 +95,9 @@ class RunRenderer:
         return np.pad(image, ((rows // 2, rows - rows // 2), (0, 0), (0, 0)))
 
     def nearest(self, cam_from_world: Tensor) -> View:
-        """Return the view of the scene that is nearest to a pose."""
+        """Return the panorama of the scene that is nearest to a pose."""
         center = View("", cam_from_world, 1, 1).center
-        views = (*self.run.scene.train, *self.run.scene.test)
+        views = [view for view in (*self.run.scene.panoramas, *self.run.scene.test) if view.lens is None]
         return min(views, key=lambda view: (view.center - center.to(view.center)).norm().item())
 
     @staticmethod

@@ -1,13 +1,11 @@
-"""COLMAP models, text or binary, of EQUIRECTANGULAR cameras (in forks: SPHERICAL or SPHERE).
+"""COLMAP models, text or binary, of EQUIRECTANGULAR cameras (in forks: SPHERICAL or SPHERE), with photographs beside.
 
 COLMAP's panoramic camera has the axes of `padgs.geometry.panorama`, so poses are used unchanged: those of the images
 file, which all versions write.
 """
 
-import signal
-import threading
+from functools import partial
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import torch
@@ -29,6 +27,7 @@ from padgs.data.formats.colmap_files import (
     read_images,
     read_points,
 )
+from padgs.data.formats.colmap_lens import lens_of
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.splits import check_name
 
@@ -54,7 +53,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
         model: the folder with the model's files; None searches the usual places.
 
     Raises:
-        DataError: missing or damaged files, a camera that is not panoramic, or no pose.
+        DataError: missing or damaged files.
     """
     model = model or find_model(path)
     if model is None:
@@ -72,8 +71,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     cameras = dict(read_cameras(files["cameras"]))
     images = sorted(read_images(files["images"]), key=lambda image: image.id)
     points = read_points(files["points3D"]) if "points3D" in files else Points({}, colored, frozenset())
-    _refuse_other_cameras(images, cameras, model)
-    frames = tuple(_frame(image, cameras[image.camera], folder, model) for image in images)
+    frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
     notes = [*_file_notes(path, model, files, colored is not None), *_reference_notes(images, points)]
     return Capture(
         format="colmap",
@@ -84,17 +82,6 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
         tracks=lambda: _tracks(images, points.row_of),
         notes=(*notes, *_frame_notes(model, files["images"], images)),
     )
-
-
-def pycolmap_module() -> ModuleType:
-    """Import pycolmap without breaking PNG files of Pillow and the handler of SIGTERM."""
-    import zlib  # noqa: F401 - first, or pycolmap's deflate symbols replace the system's
-
-    import pycolmap
-
-    if threading.current_thread() is threading.main_thread():  # the handler of its library calls SIGTERM a crash
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
-    return pycolmap
 
 
 def pose_of(image: Image, where: str) -> Tensor:
@@ -150,26 +137,13 @@ def _reference_notes(images: list[Image], points: Points) -> list[str]:
     return notes
 
 
-def _refuse_other_cameras(images: list[Image], cameras: dict[int, Camera], model: Path) -> None:
-    models = {image.name: camera.model if (camera := cameras.get(image.camera)) else "missing" for image in images}
-    others = {name: found for name, found in models.items() if found not in PANORAMIC}
-    if not others:
-        return
-    way_out = (
-        f"delete the others from it (`colmap image_deleter`), so that {len(images) - len(others)} panoramas remain"
-        if len(others) < len(images)
-        else "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
-    )
-    raise DataError(
-        f"{len(others)} of {len(images)} images of {model} are of other cameras: "
-        f"{listed(f'{name} ({found})' for name, found in others.items())}; only panoramas (EQUIRECTANGULAR) can be "
-        f"used: {way_out}"
-    )
-
-
-def _frame(image: Image, camera: Camera, folder: Path, model: Path) -> Frame:
+def _frame(image: Image, camera: Camera | None, folder: Path, model: Path) -> Frame:
     name = check_name(image.name, str(find_file(model, "images")))
-    return Frame(name, folder / name, pose_of(image, f"{name} in {model}"), camera.width, camera.height)
+    where = f"{name} in {model}"
+    if camera is None:
+        raise DataError(f"{where} has a camera that the model does not hold; export the whole model")
+    lens = None if camera.model in PANORAMIC else partial(lens_of, camera, where)
+    return Frame(name, folder / name, pose_of(image, where), camera.width, camera.height, lens=lens)
 
 
 def _tracks(images: list[Image], row_of: dict[int, int]) -> Tracks:

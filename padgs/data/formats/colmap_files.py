@@ -30,9 +30,10 @@ T = TypeVar("T")
 class Camera:
     """An entry of the cameras file."""
 
-    model: str
+    model: str  # its name, or "type ID" in binary files
     width: int
     height: int
+    params: tuple[float, ...] = ()  # of other cameras than panoramas
 
 
 @dataclass(frozen=True)
@@ -66,21 +67,25 @@ def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
         for number, line in _lines(file):
             words, kinds = line.split(), (int, str, int, int)
             key, model, width, height = _fields(file, number, words, kinds, "ID MODEL WIDTH HEIGHT")
+            params = words[4:] if model not in PANORAMIC else []
             if model == "SPHERE":
                 _, *center = _fields(file, number, words[4:], (float,) * 3, "F CX CY after ID SPHERE WIDTH HEIGHT")
                 if center != [width / 2, height / 2]:
                     raise DataError(f"{file}, line {number}: CX CY of a SPHERE are {center}; they must be its middle")
-            yield key, Camera(model, width, height)
+            params = _fields(file, number, params, (float,) * len(params), "PARAMS after ID MODEL WIDTH HEIGHT")
+            yield key, Camera(model, width, height, tuple(params))
         return
 
     def entry(cursor: _Cursor) -> tuple[int, Camera]:
         key, model, width, height = cursor.take("IiQQ")
         if model not in PARAMETERS:
-            raise DataError(f"{file} holds a camera of type {model}; only EQUIRECTANGULAR (17) can be used here")
+            raise DataError(f"{file} holds a camera of type {model}, which no version of COLMAP has; export it again")
         center = struct.pack("<2d", width / 2, height / 2)
         is_sphere = model == SPHERE and cursor.data[cursor.offset + 8 : cursor.offset + 24] == center
-        cursor.take("24x" if is_sphere else f"{8 * PARAMETERS[model]}x")
-        return key, Camera(PANORAMIC[0] if is_sphere or model == EQUIRECTANGULAR else f"type {model}", width, height)
+        params = cursor.take(f"{3 if is_sphere else PARAMETERS[model]}d")
+        if is_sphere or model == EQUIRECTANGULAR:
+            return key, Camera(PANORAMIC[0], width, height)
+        return key, Camera(f"type {model}", width, height, params)
 
     yield from _entries(file, entry)
 

@@ -56,7 +56,7 @@ def convert(
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another path")
     capture = padgs.data.read(source, format, options)
-    scene = assemble(capture, options)
+    scene = assemble(capture, replace(options, cameras="panoramas"))  # no other format has photographs beside them
     try:
         destination.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(destination) as partial:

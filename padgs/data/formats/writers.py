@@ -10,7 +10,7 @@ import torch
 
 from padgs.data.capture import Cloud, DataError, Frame, Tracks
 from padgs.data.cloud import write_ply
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.poses import OPENCV_FROM_OPENGL
 from padgs.data.splits import LISTS
 

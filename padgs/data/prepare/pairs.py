@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from padgs.data.capture import natural_key
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap_lens import pycolmap_module
 
 PAIRS = ("auto", "exhaustive", "sequential", "similar")
 EXHAUSTIVE_UP_TO = 60  # images: 1770 pairs

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.capture import Cloud, Frame, Tracks
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
 from padgs.data.perspectives import looking_at

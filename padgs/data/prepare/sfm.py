@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from padgs.data.capture import DataError
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap_lens import pycolmap_module
 
 MAPPERS = ("incremental", "global")
 Progress = Callable[[int, int], None]  # (done, total)

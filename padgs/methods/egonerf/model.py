@@ -171,6 +171,8 @@ class RayPixels:
         starts, total = [], 0
         for view in views:
             image, of_pixel = image_of(view, device), weight_of(view, weight, device)
+            if view.lens is not None and weight == "solid_angle":
+                of_pixel = of_pixel * (views[0].camera.focal / view.camera.focal) ** 2
             of_pixel = of_pixel.expand(view.height, view.width).reshape(-1)
             kept = of_pixel.nonzero().squeeze(-1)
             colors.append((image.reshape(-1, 3)[kept] * 255).round().to(torch.uint8))

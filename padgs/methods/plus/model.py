@@ -35,9 +35,10 @@ class PlusModel(SplatModel):
         """Take arguments of `SplatModel`."""
         views = kwargs.get("views", ())
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
-        super().__init__(splats, options.for_views(largest, len(views)), config, **kwargs)
+        count = round(sum(view.sphere_share for view in views))
+        super().__init__(splats, options.for_views(largest, count), config, **kwargs)
         self.options = options
-        self._smoothness = options.smoothness(len(views))
+        self._smoothness = options.smoothness(count)
         self._step = 0  # last step of the schedule
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)

@@ -41,7 +41,12 @@ MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more th
 
 
 def solid_angle_pixels(view: View) -> float:
-    """Return the independent pixels of a panorama, W H times the mean cosine 2 / pi, at least `MIN_PIXELS`."""
+    """Return the independent pixels of a panorama, W H times the mean cosine 2 / pi, at least `MIN_PIXELS`.
+
+    A photograph counts as its share of a panorama with as fine pixels.
+    """
+    if view.sphere_share < 1:
+        return 4 * math.pi * view.camera.focal**2 * view.sphere_share
     return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)
 
 
@@ -57,7 +62,8 @@ def fill_sparse_cloud(scene: Scene, count: int, *, generator: torch.Generator, m
     cloud = scene.points[torch.isfinite(scene.points).all(-1)].double().cpu()
     if missing <= 0 or len(cloud) == 0:
         return scene
-    views = scene.train[:: math.ceil(len(scene.train) / MAX_SOURCE_VIEWS)]
+    panoramas = scene.panoramas
+    views = panoramas[:: math.ceil(len(panoramas) / MAX_SOURCE_VIEWS)]
     per_view = math.ceil(missing / len(views))
     parts = [_pixels_as_points(view, cloud, per_view, generator, scene.train, measured) for view in views]
     points, colors = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -199,7 +205,7 @@ def room_count(scene: Scene) -> float:
     points = points[points.isfinite().all(1)]
     if len(points) == 0:
         return 1.0  # the initialisation reports the empty cloud
-    views = scene.train[:: -(-len(scene.train) // ROOM_VIEWS)]
+    views = scene.panoramas[:: -(-len(scene.panoramas) // ROOM_VIEWS)]
     visible = sum(visible_points(points, view).double().mean().item() for view in views) / len(views)
     return max(1.0, 1 / (SINGLE_ROOM * visible))
 

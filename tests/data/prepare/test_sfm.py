@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from padgs.data.capture import Cloud, Frame
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.prepare import work
 from padgs.data.prepare.pairs import EXHAUSTIVE_UP_TO, image_pairs, similarities
 from padgs.data.prepare.pipeline import level_world
