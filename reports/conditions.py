@@ -108,7 +108,9 @@ def _sentence(runs: DataFrame, protocols: Iterable[str]) -> str:
         " / ".join(map(str, values.unique())) or "none" for values in columns
     )
     made = f"learning rates {rates}, seeds {seeds}, padgs {versions}, {machines}."
-    return f"protocol {'; '.join(rules)}, {sizes}, {lengths}, {made}"
+    tested = " / ".join(runs["cameras"].dropna().unique())
+    views = f" test views: {tested}," if tested else ""  # all others are panoramas
+    return f"protocol {'; '.join(rules)}, {sizes},{views} {lengths}, {made}"
 
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:

@@ -7,6 +7,7 @@ each key of its configuration (`config.train.iterations`), None where missing.
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
@@ -55,7 +56,7 @@ def row_of(run: Run) -> tuple[dict[str, Any], ...]:
 
 def _cleaned(result: Result) -> Result:
     """Return a result whose texts are one line without control characters, as every report shows them."""
-    names = ("run", "variant", "scene", "code_version", "machine", "config", "finished", "external")
+    names = ("run", "variant", "scene", "code_version", "machine", "config", "finished", "external", "cameras")
     scores = {
         name: replace(of, protocol=_one_line(of.protocol), metrics=_one_line(of.metrics))
         for name, of in result.scores.items()
@@ -213,6 +214,15 @@ def _factor(result: Result) -> float | None:
     return 1.0 if choice == "published" else law(result.iterations, result.method) if choice == "run" else float(choice)
 
 
+def _kinds(cameras: Mapping[str, str]) -> str | None:
+    """Return the number of test views of each kind of camera; None if all are panoramas.
+
+    >>> _kinds({"a": "panorama", "b": "pinhole", "c": "panorama"})
+    '2 panorama, 1 pinhole'
+    """
+    return ", ".join(f"{count} {kind}" for kind, count in Counter(cameras.values()).items()) or None
+
+
 def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what a search for the smallest model found, if it has the numbers that tables and charts show."""
     for step in found.get("steps", ()):
@@ -270,6 +280,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],
+    "cameras": lambda result: _kinds(result.cameras),
     "length": lambda result: None if result.external else _length(result),
     "learning_rates": _learning_rates,
     "hardware": _hardware,

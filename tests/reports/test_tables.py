@@ -190,6 +190,13 @@ def test_calibrating_methods_are_ranked_where_there_is_something_to_calibrate(me
     assert not ranked("", **{knob: 0.1}), "photographs ignore the generator's keys"
 
 
+def test_cameras_of_test_views_are_named_where_some_are_no_panoramas():
+    runs = compared([ROOM], seeds=1)
+    assert not any("test views" in note for note in table1(run_set(runs)).notes)
+    made = [replace(run, cameras={"a": "panorama", "b": "pinhole", "c": "panorama"}) for run in runs]
+    assert any("test views: 2 panorama, 1 pinhole, 1500 iterations" in note for note in table1(run_set(made)).notes)
+
+
 def test_initial_size_and_processor_time_have_columns():
     first, second = small(24, method="omnigs"), small(25)
     counts, timing = {**second.counts, "start": 72_000}, {**second.timing, "cpu_seconds": 57.0}
