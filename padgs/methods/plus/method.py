@@ -54,8 +54,8 @@ class PlusOptions(SplatOptions):
     split: str = "long_axis"
     error_share: float = 0.5
     min_opacity: float = 0.05  # fainter Gaussians are pruned after each round
-    initial_per_pixel: float | None = 0.4
-    depth_init_per_pixel: float = 0.4
+    initial_per_pixel: float | None = 0.6
+    depth_init_per_pixel: float = 0.6
     sky_per_point: float = 0.5
     initial_opacity: float = 0.5
     initial_scale: float = 0.6
