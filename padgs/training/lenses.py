@@ -212,7 +212,7 @@ class DualLens(nn.Module):
         back = draw(second, mean_offsets=front.mean_offsets)  # both add to one positional gradient
         assert isinstance(view.camera, Panorama)
         _, weight = _sphere(view.camera, self._axis_name, self.blend, self.gap.device)
-        return replace(front, rendering=stitched(front.rendering, back.rendering, weight), view=view)
+        return replace(front, rendering=stitched(front.rendering, back.rendering, weight))
 
     def summary(self) -> str:
         """Return the result as a sentence."""

@@ -58,7 +58,6 @@ class TrainingRender:
     slots: Tensor  # [N] int64: row of the model's statistics for each drawn Gaussian
     _: KW_ONLY
     penalty: Tensor | None = None  # scalar, added to the loss
-    view: View | None = None  # that was rendered, for growth by error
 
     @classmethod
     def of_pixels(cls, rendering: Rendering, penalty: Tensor | None = None) -> TrainingRender:

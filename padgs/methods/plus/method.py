@@ -1,8 +1,8 @@
 """padgs_plus: the method of this project, each part chosen by measurement (docs/plus.md).
 
-Explicit Gaussians, rendered exactly along each ray, are densified in eight rounds, half of the new ones at pixels that
-are rendered wrong, and pruned by importance in a ninth. No constant is in world units, numbers follow the pixels of the
-images, and latitude is no special case. Each part is an option that can be switched off (`+experiment=plus_ablation`).
+Explicit Gaussians, rendered exactly along each ray, are densified in eight rounds and pruned by importance in a ninth.
+No constant is in world units, numbers follow the pixels of the images, and latitude is no special case. Each part is an
+option that can be switched off (`+experiment=plus_ablation`).
 
 The number of Gaussians: `SplatMethod.build_model` sets the initial number and the limit,
 `padgs.methods.splats.densification` adds Gaussians above a threshold, `padgs.methods.splats.importance` prunes them.
@@ -52,7 +52,6 @@ class PlusOptions(SplatOptions):
     threshold_full_views: int = 28  # fewer views lower the threshold less, by sqrt(views / this); 0: never less
     sample_clones: bool = True
     split: str = "long_axis"
-    error_share: float = 0.5
     min_opacity: float = 0.05  # fainter Gaussians are pruned after each round
     initial_per_pixel: float | None = 0.6
     depth_init_per_pixel: float = 0.6

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from padgs.checks import check, check_known
 from padgs.gaussians import rotation_matrices
-from padgs.methods.splats.error_growth import WrongPixels
 from padgs.methods.splats.splats import Splats
 from padgs.training.optimizer import append_rows, forget_moments, keep_rows
 from padgs.training.schedule import scaled
@@ -50,7 +49,6 @@ class DensificationOptions:
     # random: two pieces at random inside the Gaussian (3DGS). long_axis: two along its longest axis, which together are
     # as opaque in the middle as it was (Improved-GS).
     split: str = "random"
-    error_share: float = 0.0  # of the new Gaussians of a round that are placed at pixels by their error, `WrongPixels`
     min_opacity: float = 0.005  # fainter Gaussians are pruned
     opacity_decay: float = 0.0  # subtracted from all opacities in every round
     prune_by_extent: bool = False  # also prune scales above max_scale; empties scenes with little camera motion
@@ -66,7 +64,6 @@ class DensificationOptions:
         check(self, "an iteration, at least 0", lambda iteration: iteration >= 0, *times)
         sizes = ("gradient_threshold", "percent_dense", "max_scale")
         check(self, ">= 0 and finite", lambda value: 0 <= value < math.inf, *sizes)
-        check(self, "a share in [0, 1]", lambda share: 0 <= share <= 1, "error_share")
         check_known(self, positional_gradient=POSITIONAL_GRADIENTS, split=SPLITS)
         check(self, "an opacity > 0", lambda opacity: 0 < opacity <= 1, "reset_opacity")
         check(self, "an opacity below 1", lambda opacity: 0 <= opacity < 1, "opacity_decay", "min_opacity")
@@ -92,7 +89,6 @@ class Densifier:
         statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, and for
             space_absolute absolute [N] gradients.
         generator: random positions of new Gaussians, on the CPU.
-        wrong_pixels: candidates for growth by error; None without it.
     """
 
     def __init__(
@@ -115,7 +111,6 @@ class Densifier:
         self.splats, self.options, self.extent = splats, options, extent
         self._target = target
         self.generator = torch.Generator().manual_seed(seed)
-        self.wrong_pixels = WrongPixels(self.generator) if options.error_share > 0 else None
         self.statistics = self._empty()
 
     def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
@@ -141,22 +136,21 @@ class Densifier:
             return ()
         events = []
         if iteration > options.densify_from and iteration % options.densify_every == 0 and grows():
-            added, cloned, split, left_out = self._multiply(optimizer, iteration)
+            cloned, split, left_out = self._multiply(optimizer, iteration)
             pruned = self._prune(optimizer, iteration)
             self._decay_opacities(optimizer)
             self.reset_statistics()
-            at_pixels = f"added {added} at pixels, " if added else ""
-            events.append(f"{at_pixels}cloned {cloned}, split {split}, pruned {pruned} Gaussians")
+            events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
             if left_out:
-                total = added + cloned + split + left_out
+                total = cloned + split + left_out
                 events.append(f"max_gaussians {options.max_gaussians} left out {left_out} of {total} candidates")
         if iteration % options.reset_every == 0:
             self._reset_opacities(optimizer)
             events.append("reset opacities")
         return tuple(events)
 
-    def _multiply(self, optimizer: torch.optim.Adam, iteration: int) -> tuple[int, int, int, int]:
-        """Add, clone and split within `max_gaussians`; return the numbers added, cloned, split and left out."""
+    def _multiply(self, optimizer: torch.optim.Adam, iteration: int) -> tuple[int, int, int]:
+        """Clone and split within `max_gaussians`; return the numbers cloned, split and left out."""
         rows = self.splats.rows()
         seen = self.statistics["seen"].clamp(min=1)
         mean_gradient = self.statistics["gradient"] / seen
@@ -168,20 +162,15 @@ class Densifier:
             room = max(0, self.options.max_gaussians - len(chosen))
             if candidate_count > room:
                 chosen = _largest(torch.where(chosen, mean_gradient, -1.0), room)
-        new = {name: value[:0] for name, value in rows.items()}
-        if self.wrong_pixels is not None:
-            wanted = int(chosen.sum())
-            new = self.wrong_pixels.take(round(self.options.error_share * wanted), rows)
-            chosen = _largest(torch.where(chosen, mean_gradient, -1.0), wanted - len(new["means"]))
         small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
         clones = self._copies(chosen & small, 1, sampled=self.options.sample_clones)
         pieces = self._pieces(chosen & ~small)
-        append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name], new[name])) for name in rows})
+        append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name])) for name in rows})
         replaced = torch.zeros(len(self.splats), dtype=torch.bool, device=chosen.device)
         replaced[: len(chosen)] = chosen & ~small
         keep_rows(rows, optimizer, ~replaced)
-        added, cloned, split = len(new["means"]), len(clones["means"]), len(pieces["means"]) // PIECES
-        return added, cloned, split, candidate_count - added - cloned - split
+        cloned, split = len(clones["means"]), len(pieces["means"]) // PIECES
+        return cloned, split, candidate_count - cloned - split
 
     def _above_threshold(self, mean_gradient: Tensor, seen: Tensor) -> Tensor:
         """Return which Gaussians [N] exceed the threshold; means are over `seen` [N] views."""

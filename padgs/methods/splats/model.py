@@ -21,7 +21,7 @@ from padgs.training.optimizer import keep_rows
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
 
 OFFSET_COLUMNS = {"image": 2, "space": 3, "space_absolute": 4}  # of `mean_offsets`, by positional gradient
-FILTER_VARIANCES, WRONG_PIXELS = "filter/variances", "wrong_pixels"  # keys in a state
+FILTER_VARIANCES = "filter/variances"  # key in a state
 DEGREE_EVERY = 1000  # published iterations between two SH degrees
 
 
@@ -97,7 +97,7 @@ class SplatModel:
         else:
             rendering = self._rendered(gaussians, view, absgrad=absolute)
         slots = torch.arange(len(offsets), device=offsets.device)
-        return TrainingRender(rendering, offsets, gaussians, slots, view=view)
+        return TrainingRender(rendering, offsets, gaussians, slots)
 
     def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
         return render(gaussians, view, self.render_options(view), backend=self._config.backend, **offsets)
@@ -107,11 +107,8 @@ class SplatModel:
         return gaussians if self._filter is None else self._filter(gaussians)
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
-        """Collect positional gradients, and wrong pixels while the model grows by them."""
+        """Collect positional gradients."""
         assert drawing.mean_offsets.grad is not None, "observe is called after draw and backward"
-        wrong_pixels = self.densifier.wrong_pixels
-        if wrong_pixels is not None and drawing.view is not None and iteration < self.densifier.options.densify_until:
-            wrong_pixels.observe(drawing.view, drawing.rendering)
         self.densifier.observe(drawing.mean_offsets.grad, drawing.rendering.visible, iteration)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
@@ -212,8 +209,6 @@ class SplatModel:
         tensors["random/pieces"] = self.densifier.generator.get_state()
         if self._filter is not None:
             tensors[FILTER_VARIANCES] = self._filter.variances
-        if self.densifier.wrong_pixels is not None:
-            tensors[WRONG_PIXELS] = self.densifier.wrong_pixels.rows
         values = {
             "active_degree": self.splats.active_degree,
             "degree": self.splats.degree,
@@ -233,8 +228,6 @@ class SplatModel:
         self.pruning.done = state.values["pruned"]
         if self._filter is not None:
             self._filter.variances = state.tensors[FILTER_VARIANCES].to(device, copy=True)
-        if self.densifier.wrong_pixels is not None:
-            self.densifier.wrong_pixels.rows = state.tensors[WRONG_PIXELS].to(device, copy=True)
 
     def load_model(self, state: State) -> None:
         """Load the parameters only; densification starts anew."""

@@ -31,8 +31,7 @@ def export(*arguments: str):
 
 @pytest.fixture(scope="module")
 def splat_run(tmp_path_factory):
-    # Growth by error makes Gaussians as small as the 32 pixels of a row allow, which the 3D filter changes most.
-    return tiny_run(tmp_path_factory, "method=padgs_plus", "method.error_share=0.0")
+    return tiny_run(tmp_path_factory, "method=padgs_plus")
 
 
 def test_an_exported_run_scores_like_the_run(splat_run):

@@ -242,3 +242,25 @@ def test_invalid_options_are_refused():
     ):
         with pytest.raises(ValueError, match=f"{name} (is )?'?{value}'?{rule}"):
             DensificationOptions(**{name: value})
+
+
+def test_pieces_of_the_longest_axis_keep_its_variance_and_the_opacity_of_the_middle():
+    scales, opacity, turn = torch.tensor([0.2, 1.0, 0.4]), 0.7, torch.tensor([0.8, 0.3, -0.4, 0.2])
+    splats = Splats(torch.zeros(2, 3), scales.log().repeat(2, 1), torch.rand(2, 3))
+    splats.quats.data, splats.opacity_logits.data = turn.repeat(2, 1), torch.full((2,), opacity).logit()
+    optimizer = torch.optim.Adam(splats.parameters(), lr=0.0, fused=True)
+    grown = Densifier(splats, DensificationOptions(densify_from=0, densify_every=10, split="long_axis"), extent=1.0)
+    grown.observe(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.ones(2, dtype=torch.bool), iteration=1)
+    assert grown.adapt(10, optimizer) == ("cloned 0, split 1, pruned 0 Gaussians",)
+    means, widths = splats.means[1:], splats.log_scales[1:].exp()
+    axis = rotation_matrices(turn)[:, 1]
+    assert torch.allclose(means, torch.stack((0.7 * axis, -0.7 * axis)), atol=1e-6)
+    assert torch.allclose(widths[:, 1].square() + 0.7**2, torch.ones(2)), "variance of the pair"
+    assert torch.allclose(widths[:, [0, 2]], 0.7 * scales[[0, 2]].expand(2, 2))
+    alpha = splats.opacity_logits[1:].sigmoid() * torch.exp(-0.5 * 0.7**2 / widths[:, 1].square())
+    assert (1 - (1 - alpha).prod()).item() == pytest.approx(opacity, abs=1e-5)
+
+
+def test_an_unknown_split_is_refused():
+    with pytest.raises(ValueError, match="split"):
+        DensificationOptions(split="short_axis")

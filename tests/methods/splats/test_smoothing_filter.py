@@ -13,7 +13,7 @@ from padgs.scene import View
 from padgs.training.options import Budget
 
 # Gaussians at equal distances are blended in their order; these options leave few.
-OPTIONS = PlusOptions(initial_per_pixel=None, error_share=0.0, split="random")
+OPTIONS = PlusOptions(initial_per_pixel=None, split="random")
 
 
 @pytest.fixture(scope="module")
