@@ -76,6 +76,7 @@ class _Builder:
         blocks: list[Block] = []
         single: list[Block] = []
         notes: list[str] = []
+        there = list(by_place(self.runs))
         for title, place, runs in self._groups():
             refuse_mixture(runs, self.request, title, self.spec.shared)
             self.shown[title] = runs
@@ -83,7 +84,7 @@ class _Builder:
                 single += self._blocks(title, place, runs)
         for dataset in self.spec.paper if self.spec.averages else ():
             every = published.scenes(published.load(), published.DATASETS[dataset])
-            if done := [of for of in self._places() if of.dataset == dataset and not of.apart]:
+            if done := [of for of in there if of.dataset == dataset and not of.apart]:
                 done.sort(key=lambda place: every.index(place.scene) if place.scene in every else len(every))
                 blocks += self._average(published.TITLES[dataset], done, len(every))
                 if missing := [scene for scene in every if scene not in {place.scene for place in done}]:
@@ -91,7 +92,7 @@ class _Builder:
                 if self.spec.scenes_down:
                     blocks += self._scenes_down(dataset, done)
         if self.spec.averages:
-            others = [place for place in self._places() if not place.apart and place.dataset not in self.spec.paper]
+            others = [place for place in there if not place.apart and place.dataset not in self.spec.paper]
             for kind in dict.fromkeys(place.seen for place in others):
                 alike = [place for place in others if place.seen == kind]
                 try:
@@ -103,13 +104,10 @@ class _Builder:
             delta = any(measure.difference for measure in self.measures)
             words = "; Δ = ours - paper, at the size and length of the paper only" if delta else ""
             notes.append(f"'paper': published numbers, from one RTX 3090 Ti{words}.")
-        if any(place.seen for place in self._places()):
+        if any(place.seen for place in there):
             notes.append(SEEN_NOTE)
         notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference]), *self.spec.notes]
         return Table(self.name, self.spec.title, self.spec.corner, self._columns(), (*blocks, *single), tuple(notes))
-
-    def _places(self) -> list[Place]:
-        return list(by_place(self.runs))
 
     def _select(self, run_set: RunSet) -> DataFrame:
         spec = self.spec
@@ -157,11 +155,9 @@ class _Builder:
                 ours = over_seeds(own, self.measures)
                 cells[value] = unrank(ours) if value in not_ranked else ours
             heading = f"{methods.name(method)}, {title}" if spec.difference else title
-            theirs = {value: published.row(self.paper, *self._where(place), self._method(value)) for value in titles}
+            where = (self.spec.paper.get(place.dataset, 0), place)
+            theirs = {value: published.row(self.paper, *where, self._method(value)) for value in titles}
             yield Block(heading, self._rows(titles, cells, theirs, runs))
-
-    def _where(self, place: Place) -> tuple[int, Place]:
-        return self.spec.paper.get(place.dataset, 0), place
 
     def _method(self, value: str) -> str:
         """Return the method of the published numbers that a row may stand beside."""
@@ -286,17 +282,15 @@ class _Pivot(_Builder):
     def build(self) -> Table:
         spec, (measure,) = self.spec, self.measures
         keys = sorted({*self.runs[list(spec.pivot)].itertuples(index=False, name=None)})
+        headings = [", ".join([f"{key[-1]} iterations", *(RATES[rates] for rates in key[:-1])]) for key in keys]
+        columns = tuple(Column(heading, 2, measure.column.higher_is_better) for heading in headings)
         blocks: list[Block] = []
         notes: list[str] = []
         for title, _, runs in self._groups():
             refuse_mixture(runs, self.request, title, spec.shared)
             self.shown[title] = runs
             add = self._factors if [*spec.pivot] == ["iterations"] else self._lengths
-            blocks += add(title, runs, keys)
-        lengths = [f"{key[-1]} iterations" for key in keys]
-        headings = [
-            ", ".join([words, *(RATES[rates] for rates in key[:-1])]) for key, words in zip(keys, lengths, strict=True)
-        ]
+            blocks += add(title, runs, dict(zip(keys, columns, strict=True)))
         if [*spec.pivot] == ["iterations"]:
             factors = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
             notes.append(
@@ -305,7 +299,6 @@ class _Pivot(_Builder):
                 "loss is the difference, seed by seed, of the factor nearest to it (by their ratio) "
                 "from the one with the best mean."
             )
-        columns = tuple(Column(heading, 2, measure.column.higher_is_better) for heading in headings)
         notes = [*footnotes(self.shown, *self.protocols), *notes, *spec.notes]
         return Table(self.name, spec.title, spec.corner, columns, tuple(blocks), tuple(notes))
 
@@ -317,7 +310,7 @@ class _Pivot(_Builder):
             found.setdefault(row, {})[tuple(key)] = over_seeds(own, self.measures)[0], own
         return found
 
-    def _factors(self, title: str, runs: DataFrame, keys: Sequence[Any]) -> list[Block]:
+    def _factors(self, title: str, runs: DataFrame, keys: Mapping[Any, Column]) -> list[Block]:
         """Return a block for each method, and one with the loss by the law."""
         blocks, losses = [], []
         for preset in methods.ordered(runs["preset"]):
@@ -326,8 +319,9 @@ class _Pivot(_Builder):
             rows = (Row(f"× {f:g}", tuple(cells[f].get(key, (Cell(),))[0] for key in keys)) for f in sorted(cells))
             blocks.append(Block(where, tuple(rows)))
             of_lengths = ({factor: of[key] for factor, of in cells.items() if key in of} for key in keys)
-            losses.append(Row(methods.title(preset), tuple(map(partial(self._loss, preset), keys, of_lengths))))
-        return [*blocks, Block(f"What the law loses, {title}", tuple(losses), signed=True)]
+            losses.append(Row(methods.title(preset), tuple(map(partial(self._loss, preset), keys, of_lengths)), True))
+        columns = tuple(replace(column, higher_is_better=None) for column in keys.values())
+        return [*blocks, Block(f"What the law loses, {title}", tuple(losses), columns)]
 
     def _loss(self, preset: str, key: tuple[int], factors: Mapping[float, tuple[Cell, DataFrame]]) -> Cell:
         means = {factor: cell.value for factor, (cell, _) in factors.items() if cell.value is not None}
@@ -339,7 +333,7 @@ class _Pivot(_Builder):
         ours, others = (factors[f][1].query("ok").set_index("seed")[column].astype(float) for f in (near, best))
         return mean_cell((ours - others).dropna().tolist())
 
-    def _lengths(self, title: str, runs: DataFrame, keys: Sequence[Any]) -> list[Block]:
+    def _lengths(self, title: str, runs: DataFrame, keys: Mapping[Any, Column]) -> list[Block]:
         cells = self._cells(runs, title, "preset", *self.spec.pivot)
         rows = (
             Row(methods.title(preset), tuple(cells[preset].get(key, (Cell(),))[0] for key in keys))

@@ -151,11 +151,8 @@ def _verdict(evidence: Evidence) -> str:
     if advantages.mean() > 0:
         return HOLDS
     as_published = evidence.claim.source == OURS or evidence.tested["as published"].all()
-    return FAILS if as_published else f"{NOT_REPRODUCED} at {_sizes(evidence)}"
-
-
-def _sizes(evidence: Evidence) -> str:
-    return " and ".join(sorted(evidence.tested["size"].unique(), key=lambda size: int(size.partition("x")[0])))
+    sizes = evidence.tested.sort_values("width")["size"].unique()
+    return FAILS if as_published else f"{NOT_REPRODUCED} at {' and '.join(sizes)}"
 
 
 def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:

@@ -51,7 +51,8 @@ def row_of(run: Run) -> tuple[dict[str, Any], ...]:
     result = _cleaned(run.result)
     numbers = {name: None if (value := of(result)) is None else float(value) for name, of in NUMBERS.items()}
     facts = {name: of(result) for name, of in FACTS.items()}
-    return facts, dict(_rules(result)), dict(_metrics(result)), numbers, dict(_flat(result.config))
+    metrics = {f"{name}/{metric}": value for name, of in result.scores.items() for metric, value in of.metrics.items()}
+    return facts, dict(_rules(result)), metrics, numbers, dict(_flat(result.config))
 
 
 def _cleaned(result: Result) -> Result:
@@ -80,11 +81,8 @@ def grouped(runs: DataFrame, *columns: str) -> list[tuple[tuple[Any, ...], DataF
     rows: dict[tuple[Any, ...], list[int]] = {}
     for number, values in enumerate(zip(*(runs[column] for column in columns), strict=True)):
         rows.setdefault(values, []).append(number)
-    return [(values, runs.take(numbers)) for values, numbers in rows.items() if not any(map(_is_missing, values))]
-
-
-def _is_missing(value: Any) -> bool:
-    return value is None or value != value  # NaN
+    known = (values for values in rows if all(value is not None and value == value for value in values))  # nor NaN
+    return [(values, runs.take(rows[values])) for values in known]
 
 
 def by_place(runs: DataFrame) -> dict[Place, DataFrame]:
@@ -182,12 +180,6 @@ def _rules(result: Result) -> Iterator[tuple[str, str]]:
         if rules.get("bottom_crop"):
             words.append(f"without the last {100 * rules['bottom_crop']:.1f} % of the rows")
         yield f"{name} rules", ", ".join(words)
-
-
-def _metrics(result: Result) -> Iterator[tuple[str, float | None]]:
-    for name, scores in result.scores.items():
-        for metric, value in scores.metrics.items():
-            yield f"{name}/{metric}", value
 
 
 def _length(result: Result) -> str:

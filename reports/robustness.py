@@ -100,24 +100,12 @@ class StressedMethod:
     @cached_property
     def robustness(self) -> dict[Stress, Cell]:
         """Robustness under each condition and level, with the status of failed runs."""
-        return {stress: self._robustness(own) for stress, own in self.runs.items()}
-
-    def _robustness(self, runs: DataFrame) -> Cell:
-        above = (self.reference[QUALITY] - self.reference[ONE_COLOR]).set_axis(self.reference["seed"])
-        without = runs["seed"].map(above).fillna(above.mean())  # a seed without reference has the mean of the others
-        shares = ((runs[QUALITY] - runs[ONE_COLOR]) / without).clip(0, 1).where(runs["ok"], 0.0)
-        return mean_cell(shares.tolist(), _failures(runs))
-
-    @property
-    def place(self) -> str:
-        """Scene and resolution, as a part of file names."""
-        first = self.reference.iloc[0]
-        return file_name(f"{first['place'].stem}-{first['resolution']}")
-
-    @property
-    def conditions(self) -> list[str]:
-        """Conditions in the order of the runs."""
-        return list(dict.fromkeys(condition for condition, _ in self.runs))
+        above, found = (self.reference[QUALITY] - self.reference[ONE_COLOR]).set_axis(self.reference["seed"]), {}
+        for stress, runs in self.runs.items():
+            without = runs["seed"].map(above).fillna(above.mean())  # without a reference the mean of the other seeds
+            shares = ((runs[QUALITY] - runs[ONE_COLOR]) / without).clip(0, 1).where(runs["ok"], 0.0)
+            found[stress] = mean_cell(shares.tolist(), _failures(runs))
+        return found
 
     def levels(self, condition: str) -> dict[int, Cell]:
         """Return level -> robustness under a condition."""
@@ -174,7 +162,7 @@ def stressed_methods(run_set: RunSet) -> dict[str, list[StressedMethod]]:
 
 def all_stress(stressed: Sequence[StressedMethod]) -> list[Stress]:
     """Return the conditions and levels of some methods, each once, the levels of a condition together."""
-    conditions = list(dict.fromkeys(condition for one in stressed for condition in one.conditions))
+    conditions = [condition for one in stressed for condition, _ in one.runs]
     return sorted({stress for one in stressed for stress in one.runs}, key=lambda s: (conditions.index(s[0]), s[1]))
 
 
@@ -195,7 +183,7 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
         )
         known = [made for made in unstressed if any(cell.value is not None for cell in made.cells)]
         kept = [row(f"{of[0]} {of[1]}", lambda one, of=of: one.robustness.get(of, Cell())) for of in all_stress(those)]
-        conditions = dict.fromkeys(condition for one in those for condition in one.conditions)
+        conditions = dict.fromkeys(condition for condition, _ in all_stress(those))
         breaks = [row(of, lambda one, of=of: Cell(status=str(one.breakdown(of) or ""))) for of in conditions]
         blocks += [
             Block(title, (*scores, *known)),
@@ -210,8 +198,11 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
 
 def limits(run_set: RunSet) -> Table:
     """Return what methods lose under stress beside what is allowed, for scenes of the limits' size and length."""
-    found = {title: [one for one in those if _has_limits(one)] for title, those in stressed_methods(run_set).items()}
-    found = {title: those for title, those in found.items() if those}
+    found = {}
+    for title, those in stressed_methods(run_set).items():
+        kinds = [{*zip(one.reference["resolution"], one.reference["iterations"], strict=True)} for one in those]
+        if limited := [one for one, of in zip(those, kinds, strict=True) if of == {LIMITS_ARE_FOR}]:
+            found[title] = limited
     presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
     blocks = []
     for title, those in found.items():
@@ -275,7 +266,9 @@ def heat_map(title: str, stressed: Sequence[StressedMethod]) -> Chart:
     notes = ["Each cell: the distance to one colour, as a share of the method's own without stress."]
     if left_out := [methods.title(one.preset) for one in stressed if one not in shown]:
         notes.append(f"Not run under all conditions, and so left out: {', '.join(left_out)}.")
-    return Chart(f"stability-{stressed[0].place}", title, made, tuple(notes))
+    first = stressed[0].reference.iloc[0]
+    name = file_name(f"{first['place'].stem}-{first['resolution']}")
+    return Chart(f"stability-{name}", title, made, tuple(notes))
 
 
 def _row_maker(presets: Sequence[str], stressed: Sequence[StressedMethod]) -> Callable[..., Row]:
@@ -303,11 +296,6 @@ def _stressed_method(runs: DataFrame, preset: str, where: str) -> StressedMethod
         for (condition, level), alike in grouped(stressed, CONDITION, LEVEL)
     }
     return StressedMethod(preset, cells, one_setting(reference, where)) if cells and len(reference) else None
-
-
-def _has_limits(one: StressedMethod) -> bool:
-    size, iterations = LIMITS_ARE_FOR
-    return bool(((one.reference["resolution"] == size) & (one.reference["iterations"] == iterations)).all())
 
 
 def _unstressed(one: StressedMethod, name: str, *others: str) -> Cell:

@@ -197,15 +197,6 @@ def experiment_of(name: str) -> str:
     return name.partition("@")[0]
 
 
-def of_a_table(experiment: str) -> bool:
-    """Return whether an experiment belongs to a table or chart, and is no sweep.
-
-    >>> of_a_table("table1_360roam@cpu"), of_a_table("tau@cpu")
-    (True, False)
-    """
-    return any(experiment_of(experiment) in report.experiments for report in REPORTS.values())
-
-
 def settings(runs: DataFrame) -> list[Setting]:
     """Return the settings among the runs of one scene, in the order of the methods and of the changed values."""
     found = []
@@ -250,8 +241,7 @@ def differing_keys(runs: DataFrame) -> list[str]:
     """Return the dotted keys in which configurations differ, without seeds and keys without effect."""
     if runs["setting"].nunique() < 2:
         return []
-    keys = [name.removeprefix(CONFIG) for name in runs if name.startswith(CONFIG)]
-    keys = [key for key in keys if decides(key)]
+    keys = [key for name in runs if name.startswith(CONFIG) and decides(key := name.removeprefix(CONFIG))]
     values = runs[[CONFIG + key for key in keys]].to_numpy()
     return [key for key, column in zip(keys, values.T, strict=True) if any(value != column[0] for value in column)]
 

@@ -1,7 +1,7 @@
 """Smallest models of a quality (`padgs smallest`): a table, and charts of quality over Gaussians, bytes and time."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from padgs.reports.charts.drawing import (
     figure,
     lay_out,
     set_axis,
-    show_image,
     spans,
     styled,
 )
@@ -25,7 +24,7 @@ from padgs.reports.conditions import OF_TIMES, footnotes, sheets
 from padgs.reports.selection import RunSet, settings
 from padgs.reports.significance import mean_cell
 from padgs.reports.store import split_image
-from padgs.reports.table import Block, Cell, Column, Row, Table
+from padgs.reports.table import Block, Column, Row, Table
 from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, SMALLEST_STATED
 
 STATED = f"{SMALLEST_STATED:g}"  # dB, as results name losses
@@ -35,6 +34,7 @@ PANELS = (
     ("frame_ms", "minimal ms per frame", 1.0),
 )
 LOSSES = tuple(f"{loss:g}" for loss in SMALLEST_PICTURED)  # dB, marked in the chart by a ring and a square
+IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic
 NOTES = (
     "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
@@ -66,11 +66,6 @@ class Curve:
     def smallest(self) -> dict[str, Mapping[str, Any]]:
         """Allowed loss, as text -> smallest model."""
         return {epsilon: self.found["steps"][number] for epsilon, number in self.found["minimal"].items()}
-
-    @property
-    def quality(self) -> list[float]:
-        """Quality of the candidates, see `quality_of`."""
-        return list(map(self.quality_of, self.steps))
 
     def values(self, name: str) -> list[float]:
         """Return a number of all candidates; NaN where missing."""
@@ -112,14 +107,9 @@ def by_method(found: Sequence[Curve]) -> dict[str, list[Curve]]:
     return {method: [one for one in found if one.method == method] for method in methods}
 
 
-def _count(step: Callable[[Mapping[str, Any]], int | None]) -> Callable[[Curve], float | None]:
+def _count(own: Curve, number: int | None) -> float | None:
     """Return the count of a candidate that `padgs smallest` names; None in results that name none."""
-
-    def count(own: Curve) -> float | None:
-        number = step(own.found)
-        return None if number is None else own.found["steps"][number]["blended"]
-
-    return count
+    return None if number is None else own.found["steps"][number]["blended"]
 
 
 COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
@@ -128,10 +118,10 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
         Column(f"minimal count for {loss:g} dB", 0, False): lambda own, e=f"{loss:g}": own.smallest[e]["blended"]
         for loss in SMALLEST_LOSSES
     },
-    Column(f"at least, for {STATED} dB", 0): _count(lambda found: found.get("possible", {}).get(STATED)),
-    Column(f"by test views, for {STATED} dB", 0): _count(lambda found: found.get("by_test", {}).get(STATED)),
+    Column(f"at least, for {STATED} dB", 0): lambda own: _count(own, own.found.get("possible", {}).get(STATED)),
+    Column(f"by test views, for {STATED} dB", 0): lambda own: _count(own, own.found.get("by_test", {}).get(STATED)),
     Column(f"share for {STATED} dB", 2): lambda own: own.smallest[STATED]["rows"] / own.found["rows"],
-    Column("knee", 0): _count(lambda found: found["knee"]),
+    Column("knee", 0): lambda own: _count(own, own.found["knee"]),
     Column(f"MB for {STATED} dB", 2, False): lambda own: own.smallest[STATED]["bytes"] / 1e6,
     Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own: own.smallest[STATED]["frame_ms"],
     Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own: own.quality_of(own.smallest[STATED]),
@@ -144,18 +134,14 @@ def table(run_set: RunSet) -> Table:
     """Return a block for each scene, resolution and length, and a row for each method whose runs were searched."""
     blocks, shown = [], {}
     for _, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
-        rows = (
-            Row(method, tuple(_over_seeds(map(number, seeds)) for number in COLUMNS.values()))
-            for method, seeds in by_method(curves(own)).items()
-        )
+        rows = []
+        for method, seeds in by_method(curves(own)).items():
+            known = ([n for n in map(number, seeds) if n is not None] for number in COLUMNS.values())
+            rows.append(Row(method, tuple(map(mean_cell, known))))
         blocks.append(Block(title, tuple(rows)))
         shown[title] = own
     notes = (*footnotes(shown, run_set.request.protocol), *NOTES) if blocks else ()
     return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
-
-
-def _over_seeds(values: Iterable[float | None]) -> Cell:
-    return mean_cell([value for value in values if value is not None])
 
 
 def charts(run_set: RunSet) -> list[Chart]:
@@ -205,7 +191,9 @@ def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) 
         words = [curve.title, f"all: {steps[0]['blended']} Gaussians"]
         words += [f"{loss} dB: {step['blended']}" for loss, step in zip(LOSSES, steps[1:], strict=True)]
         for panel, part, text in zip(row, split_image(curve.image, 4), words, strict=True):
-            show_image(panel, part, text)
+            part.thumbnail((IMAGE_WIDTH, IMAGE_WIDTH))
+            panel.imshow(part)
+            panel.set_title(text)
             panel.set_axis_off()
     what = f"{title}\na test view: ground truth, whole model, and the smallest that lose {' and '.join(LOSSES)} dB"
     lay_out(made, what)
@@ -215,9 +203,10 @@ def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) 
 def _draw(panel: Any, curve: Curve, quantity: str, unit: float, color: str, *, first: bool) -> None:
     """Draw a curve; further seeds of a method are thinner."""
     xs = [value * unit for value in curve.values(quantity)]
-    there = sorted((x, y) for x, y in zip(xs, curve.quality, strict=True) if math.isfinite(x) and math.isfinite(y))
+    ys = list(map(curve.quality_of, curve.steps))
+    there = sorted((x, y) for x, y in zip(xs, ys, strict=True) if math.isfinite(x) and math.isfinite(y))
     panel.plot(*zip(*there, strict=True), color=color, linewidth=1.2 if first else 0.6)
-    for step, x, y in zip(curve.steps, xs, curve.quality, strict=True):
+    for step, x, y in zip(curve.steps, xs, ys, strict=True):
         panel.plot([x], [y], MARKERS[0], color=color, markersize=4 if first else 2.5)
         for loss, around in zip(LOSSES, MARKERS, strict=False):
             if curve.smallest.get(loss) is step:

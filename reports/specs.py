@@ -98,8 +98,7 @@ def _with_budget(runs: DataFrame) -> DataFrame:
 
 def _with_rates(runs: DataFrame) -> DataFrame:
     """Keep runs with published rates or those for the run; other factors are for `learning_rates`."""
-    rates = runs[RATES].fillna("published") if RATES in runs else "published"
-    runs = runs.assign(rates=rates)
+    runs = runs.assign(rates=runs[RATES].fillna("published") if RATES in runs else "published")
     return runs.loc[runs["rates"].isin(["published", "run"])]
 
 
@@ -108,16 +107,12 @@ def _crossed(runs: DataFrame) -> DataFrame:
     return runs.assign(crossed=[f"{preset} {tau}" for preset, tau in zip(runs["preset"], taus, strict=True)])
 
 
-def _begun(runs: DataFrame) -> DataFrame:
-    return runs.loc[runs["iterations"] > 0]  # a run of seconds may fail before its first
-
-
 PREPARE: Mapping[str, Callable[[DataFrame], DataFrame]] = {
     "": lambda runs: runs,
     "with_budget": _with_budget,
     "with_rates": _with_rates,
     "crossed": _crossed,
-    "begun": _begun,
+    "begun": lambda runs: runs.loc[runs["iterations"] > 0],  # a run of seconds may fail before its first
 }
 TITLES: Mapping[str, Mapping[str, Mapping[str, str]]] = {  # method -> value -> title
     "": {},

@@ -82,24 +82,20 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
         OSError: the store cannot be written; the old one stays.
     """
     with FileLock(store.with_name(f".{store.name}.lock"), timeout=PATIENCE):
-        return _add(runs, store)
-
-
-def _add(runs: Iterable[Run], store: Path) -> list[Run]:
-    stored, damaged = read(store) if store.exists() else ([], [])
-    if damaged:
-        raise damaged[0]
-    by_name: dict[str, Run] = {}
-    for run in (*stored, *runs):
-        if known := by_name.get(run.result.run):  # its tables need the run, too
-            experiments = results.joined(known.result.experiments, run.result.experiments)
-            if experiments != run.result.experiments:
-                run = replace(run, result=replace(run.result, experiments=experiments), document=None)
-        by_name[run.result.run] = run
-    merged = [by_name[name] for name in sorted(by_name)]
-    lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in merged)
-    texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
-    write_atomically(store, "".join(f"{text}\n" for text in texts).encode())
+        stored, damaged = read(store) if store.exists() else ([], [])
+        if damaged:
+            raise damaged[0]
+        by_name: dict[str, Run] = {}
+        for run in (*stored, *runs):
+            if known := by_name.get(run.result.run):  # its tables need the run, too
+                experiments = results.joined(known.result.experiments, run.result.experiments)
+                if experiments != run.result.experiments:
+                    run = replace(run, result=replace(run.result, experiments=experiments), document=None)
+            by_name[run.result.run] = run
+        merged = [by_name[name] for name in sorted(by_name)]
+        lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in merged)
+        texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
+        write_atomically(store, "".join(f"{text}\n" for text in texts).encode())
     return merged
 
 

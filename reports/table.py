@@ -93,16 +93,8 @@ class Block:
 
     title: str
     rows: tuple[Row, ...]
-    signed: bool = False  # differences: with signs, and without a best
     own_columns: tuple[Column, ...] = ()  # instead of the table's
     across: Column | None = None  # all cells are of this column, and the best is sought within each row
-
-    def columns(self, columns: Sequence[Column]) -> tuple[Column, ...]:
-        """Return the table's columns as they apply to this block."""
-        columns = self.own_columns or columns
-        if not self.signed:
-            return tuple(columns)
-        return tuple(replace(column, signed=True, higher_is_better=None) for column in columns)
 
 
 @dataclass(frozen=True)
@@ -118,7 +110,7 @@ class Table:
 
     def single(self, block: Block, *, drop_empty: bool = False) -> Table:
         """Return one block as a table without empty optional columns, or with `drop_empty` without any empty column."""
-        every = block.columns(self.columns)
+        every = block.own_columns or self.columns
         kept = [
             index
             for index, column in enumerate(every)

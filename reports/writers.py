@@ -51,7 +51,9 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
         for extension, write in (("md", markdown), ("tex", latex), ("csv", csv_text)) if made.blocks else ():
             yield f"{made.name}.{extension}", write(made).encode()
     elif isinstance(made, Chart):
-        name = _short(file_name(made.name))
+        name = file_name(made.name)
+        if len(name) > LONGEST:  # which file systems do not accept with an ending
+            name = f"{name[: LONGEST - 10]}-{hashlib.sha256(name.encode()).hexdigest()[:9]}"
         yield f"{name}.png", made.png
         if svg and not isinstance(made.figure, Image.Image):
             yield f"{name}.svg", made.svg.encode()
@@ -76,11 +78,6 @@ def rendered(template: str, **values: Any) -> str:
     )
     environment.filters["md"] = markdown_text
     return environment.get_template(template).render(**values)
-
-
-def _short(name: str) -> str:
-    """Return a name that file systems accept with an ending."""
-    return name if len(name) <= LONGEST else f"{name[: LONGEST - 10]}-{hashlib.sha256(name.encode()).hexdigest()[:9]}"
 
 
 def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
@@ -154,7 +151,7 @@ def csv_text(table: Table) -> str:
     """Return CSV with a line for each cell and all digits; without a number `value` is empty and `status` says why."""
     rows = []
     for block in table.blocks:
-        columns = block.columns(table.columns)
+        columns = block.own_columns or table.columns
         ranks = marks(block, columns)
         for number, row in enumerate(block.rows):
             for cell, column, rank in zip(row.cells, columns, ranks, strict=True):

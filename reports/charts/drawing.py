@@ -25,7 +25,6 @@ PAPER = "#ffffff"
 COLORS = (*(method["color"] for method in METHODS.values()), *OTHERS)
 ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
-IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 DPI = 110
 TITLE_SIZE, SMALL_TITLE_SIZE, NARROW = 10.5, 9.0, 5.0  # points; the small one in figures of up to NARROW inches
 LETTERS = 126  # letters per inch at a font size of one point
@@ -127,21 +126,13 @@ def lay_out(made: Any, title: str) -> None:
     """Write the title and fix the layout, so that later additions can refer to positions in the figure."""
     size = TITLE_SIZE if made.get_figwidth() > NARROW else SMALL_TITLE_SIZE
     made.suptitle(wrap_title(title, int(LETTERS * made.get_figwidth() / size)), fontsize=size)
-    if engine := made.get_layout_engine():
-        engine.execute(made)
+    made.get_layout_engine().execute(made)
     made.set_layout_engine("none")
 
 
 def wrap_title(title: str, letters: int) -> str:
     """Return a title in lines of at most so many letters."""
     return "\n".join(part for line in title.split("\n") for part in wrap(line, letters))
-
-
-def show_image(panel: Any, image: Any, title: str) -> None:
-    """Show an image of at most `IMAGE_WIDTH` pixels with a title."""
-    image.thumbnail((IMAGE_WIDTH, IMAGE_WIDTH))
-    panel.imshow(image)
-    panel.set_title(title)
 
 
 def color_of(preset: str, presets: Sequence[str]) -> str:

@@ -1,9 +1,9 @@
 """A test view of each scene: the ground truth, and the render of each method above its error."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from pandas import DataFrame
 from PIL import Image, ImageDraw, ImageFont
 
@@ -44,19 +44,10 @@ def _images(runs: DataFrame, view: str, warnings: list[str]) -> list[tuple[str, 
             warnings.append(f"a picture is left out: {error}")
             continue
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])
-        image = stacked(drawn)
+        image = Image.fromarray(np.vstack([part.convert("RGB") for part in drawn]))
         renders.append((math.inf, title, image) if psnr is None else (-psnr, f"{title}: {psnr:.2f} dB", image))
     renders.sort(key=lambda one: one[0])
     return [] if truth is None else [("ground truth", truth), *((title, render) for _, title, render in renders)]
-
-
-def stacked(images: Sequence[Image.Image]) -> Image.Image:
-    """Return images of one size, each below the one before."""
-    width, height = images[0].size
-    sheet = Image.new("RGB", (width, height * len(images)))
-    for number, image in enumerate(images):
-        sheet.paste(image, (0, number * height))
-    return sheet
 
 
 def _sheet(name: str, title: str, images: list[tuple[str, Image.Image]], notes: tuple[str, ...]) -> Chart:

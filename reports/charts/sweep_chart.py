@@ -6,13 +6,13 @@ from typing import Any
 
 from pandas import DataFrame
 
-from padgs.reports import methods
+from padgs.reports import REPORTS, methods
 from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, set_axis, spans, styled
 from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
 from padgs.reports.frame import by_place, grouped
 from padgs.reports.measures import Measure, costs, metrics, quantity
 from padgs.reports.published import Place
-from padgs.reports.selection import Request, RunSet, Setting, is_number, of_a_table, settings, sort_key
+from padgs.reports.selection import Request, RunSet, Setting, experiment_of, is_number, settings, sort_key
 from padgs.reports.significance import over_seeds
 from padgs.reports.table import Cell
 from padgs.results import AD_HOC
@@ -80,8 +80,10 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
     """
     request, runs = run_set.request, run_set.requested
     measures = _measures(request, runs)
+    of_tables = {experiment for report in REPORTS.values() for experiment in report.experiments}
     known = sorted(runs["experiments"].explode().dropna().unique())
-    names = [name for name in known if (request.matches(name) if request.experiment else not of_a_table(name))]
+    chosen = request.matches if request.experiment else lambda name: experiment_of(name) not in of_tables
+    names = [name for name in known if chosen(name)]
     found = []
     for name in names:
         own = runs.loc[[name in of for of in runs["experiments"]]]

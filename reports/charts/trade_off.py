@@ -1,15 +1,14 @@
 """Speed against accuracy: a point per method and setting of a scene, or mean over finished scenes."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports import methods, published
-from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets, unranked
+from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets
 from padgs.reports.frame import by_place
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
@@ -65,11 +64,6 @@ class TradeOff:
         """True if CPU time is shown, which other programs disturb less: all runs have it, and none used a GPU."""
         own = self.runs.loc[self.runs["ok"] & ~self.runs["preset"].str.startswith(methods.EXTERNAL)]
         return bool(own["cpu_seconds"].notna().all() and own["peak_gpu_gigabytes"].isna().all())
-
-    @cached_property
-    def unranked(self) -> Collection[str]:
-        """Presets that are shown without competing, see `padgs.reports.unranked`."""
-        return unranked(self.runs)
 
     @property
     def numbers(self) -> DataFrame:

@@ -26,6 +26,7 @@ from padgs.reports.charts.drawing import (
     write_labels,
 )
 from padgs.reports.charts.trade_off import Point, TradeOff, equal_times, pareto, trade_offs
+from padgs.reports.conditions import unranked
 from padgs.reports.measures import COSTS
 from padgs.reports.selection import RunSet, Setting, settings
 
@@ -94,24 +95,22 @@ def draw(
     shown = shown or (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
     made, axes = figure(len(shown), 1, *SIZE)
     marks = [_marks(trade_off, cost) for cost, _, _ in shown]
-    presets = [point.preset for point in trade_off.points]
+    presets, apart = [point.preset for point in trade_off.points], unranked(trade_off.runs)
     for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
         panel.set_xlabel(f"{words}, {unit} ↓")
         panel.set_ylabel(f"{quality.column.title}, dB ↑")
         set_axis(panel.xaxis, [mark.x for mark in own], True, worse=1)
         set_axis(panel.yaxis, [mark.y for of in marks for mark in of], worse=-1)
-        rivals = [m for m in own if m.role != "release" and m.point.preset not in trade_off.unranked]
+        rivals = [m for m in own if m.role != "release" and m.point.preset not in apart]
         _draw_front(panel, [(mark.x, mark.y) for mark in rivals])
         for mark in own:
             _draw(panel, trade_off, mark, COSTS[cost].column.title, presets)
-    units = (unit for _, _, unit in shown)
-    beyond = wrap(" ".join(_beyond(zip(axes.flat, marks, units, strict=True))), LINE * len(shown))
+    panels = [(panel, own, unit) for panel, own, (_, _, unit) in zip(axes.flat, marks, shown, strict=True)]
+    beyond = wrap(" ".join(_beyond(panels)), LINE * len(shown))
     look = {"title": "\n".join([_conditions(trade_off), *beyond]), "ncols": 8, "fontsize": 8, "title_fontsize": 8}
     made.legend(handles=_handles([mark for of in marks for mark in of]), loc="outside lower center", **look)
     lay_out(made, trade_off.title)
-    return made, [
-        (panel, own, unit, _label(panel, own)) for panel, own, (_, _, unit) in zip(axes.flat, marks, shown, strict=True)
-    ]
+    return made, [(panel, own, unit, _label(panel, own)) for panel, own, unit in panels]
 
 
 @styled
@@ -201,12 +200,12 @@ def _marks(trade_off: TradeOff, cost: str) -> list[Mark]:
 
 def _beyond(panels: Iterable[tuple[Any, Sequence[Mark], str]]) -> list[str]:
     """Return a sentence that names the marks outside of axes; empty if there are none."""
-    found = {
-        f"{mark.point.title} ({mark.y:.1f} dB, {brief(mark.x)} {unit})"
-        for axes, marks, unit in panels
-        for mark in marks
-        if not _inside(axes, mark)
-    }
+    found = set()
+    for axes, marks, unit in panels:
+        for mark in marks:
+            if not _inside(axes, mark):
+                cost = f"{mark.x:,.0f}" if mark.x >= 1000 else f"{mark.x:.3g}"  # all digits before the point
+                found.add(f"{mark.point.title} ({mark.y:.1f} dB, {cost} {unit})")
     return [f"Beyond the axes: {'; '.join(sorted(found))}."] if found else []
 
 
@@ -250,15 +249,6 @@ def _label(panel: Any, marks: Sequence[Mark]) -> list[Any]:
         for m in sorted(inside, key=lambda mark: mark.role != "main")
     ]
     return write_labels(panel, labels, [(mark.x, mark.y, mark.radius) for mark in inside])
-
-
-def brief(value: float) -> str:
-    """Return a number with three digits, or all digits before the point.
-
-    >>> brief(24.8512), brief(123456.0)
-    ('24.9', '123,456')
-    """
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _handles(marks: Sequence[Mark]) -> list[Any]:

@@ -150,7 +150,7 @@ def _measured(table: Table) -> Table:
     """Return a table without the blocks that have only published numbers."""
 
     def has_ours(block: Block) -> bool:
-        ours = [index for index, one in enumerate(block.columns(table.columns)) if one.title not in PAPER_COLUMNS]
+        ours = [index for index, one in enumerate(block.own_columns or table.columns) if one.title not in PAPER_COLUMNS]
         return any(row.cells[index] != Cell() for row in block.rows for index in ours)
 
     return replace(table, blocks=tuple(filter(has_ours, table.blocks)))
