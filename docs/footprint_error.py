@@ -2,8 +2,8 @@
 
     python docs/footprint_error.py
 
-writes the table in docs/notes/projection_error.md and the figure docs/footprint_error.png in about two minutes. Tests
-compare the table with the numbers computed here.
+writes the table in docs/notes/projection_error.md in about two minutes. Tests compare the table with the numbers
+computed here.
 
 The truth is the ray response, the largest value of the Gaussian along each ray; projection `ray` computes it, the
 others approximate it. The error of a footprint is the integral over the sphere of |footprint - truth|, relative to the
@@ -124,28 +124,8 @@ def markdown(errors: dict[str, list[list[float]]]) -> str:
     return "\n".join(lines)
 
 
-def draw(errors: dict[str, list[list[float]]], path: Path) -> None:
-    """Plot the error over latitude, one panel for each projection, one line for each size."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(1, len(PROJECTIONS), figsize=(10, 3.4), sharey=True, constrained_layout=True)
-    colors = matplotlib.colormaps["viridis"]
-    for panel, projection in zip(panels, PROJECTIONS, strict=True):
-        for index, (sigma, row) in enumerate(zip(SIGMAS, errors[projection], strict=True)):
-            color = colors(0.9 * index / (len(SIGMAS) - 1))
-            panel.plot(LATITUDES, [100 * error for error in row], "o-", ms=3, color=color, label=f"σ = {sigma:g}°")
-        panel.set(title=projection, xlabel="latitude of the mean (degrees)", yscale="log", ylim=(0.01, 200))
-        panel.grid(alpha=0.3)
-    panels[0].set_ylabel("error (% of the mass)")
-    panels[-1].legend(loc="lower center", ncols=2, fontsize="small")
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
-    """Compute the errors, write the table, plot the figure."""
+    """Compute the errors and write the table."""
     errors = {
         projection: [[footprint_error(projection, sigma, latitude) for latitude in LATITUDES] for sigma in SIGMAS]
         for projection in PROJECTIONS
@@ -153,7 +133,6 @@ def main() -> None:
     page = FOLDER / "notes" / "projection_error.md"
     between = re.compile(r"(<!-- table -->\n).*(<!-- end -->)", re.DOTALL)
     page.write_text(between.sub(lambda found: found[1] + markdown(errors) + "\n" + found[2], page.read_text()))
-    draw(errors, FOLDER / "footprint_error.png")
 
 
 if __name__ == "__main__":

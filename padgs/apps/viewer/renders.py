@@ -111,7 +111,12 @@ class RunRenderer:
         method = self.run.through(full)
         if crop is None or not self.can_crop:
             return method
-        return crop_model(method.with_renderer(method.render_config), crop)
+        method = method.with_renderer(method.render_config)  # a copy, which can then only render
+        model = method.model
+        positions = model.anchors.positions if isinstance(model, AnchorModel) else model.splats.means
+        low, high = (positions.new_tensor(corner) for corner in crop)
+        model.keep(((positions >= low) & (positions <= high)).all(-1))
+        return method
 
     def _error_from(self, view: View, gain: float) -> np.ndarray:
         """Return the error image of the nearest view of the scene, resampled to the directions of a view."""
@@ -126,15 +131,6 @@ class RunRenderer:
         image = self.run.method.render(view).image
         truth, mask = view.image(device=image.device), view.mask(device=image.device)
         return error_image(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth, gain).copy()
-
-
-def crop_model(method: Method, crop: Box) -> Method:
-    """Remove all Gaussians or anchors outside a box, in place; the method can then only render."""
-    model = method.model
-    positions = model.anchors.positions if isinstance(model, AnchorModel) else model.splats.means
-    low, high = (positions.new_tensor(corner) for corner in crop)
-    model.keep(((positions >= low) & (positions <= high)).all(-1))
-    return method
 
 
 def level(cam_from_world: Tensor, up: Tensor) -> Tensor:

@@ -165,7 +165,8 @@ def find_source(path: Path, mask: str) -> Source:
     if others:
         notes.append(f"left out: {others}{ways_out}")
     expected = mask_folder(path)
-    if unused := [name for name in _scene_masks(folder) if mask == "auto" and (folder / name).parent != expected]:
+    scene_masks = [name for name in image_names(folder) if PurePosixPath(name).name in SCENE_MASKS]
+    if unused := [name for name in scene_masks if mask == "auto" and (folder / name).parent != expected]:
         notes.append(f"not used: {listed(unused)}; a mask of all panoramas must be in {expected}")
     digest = hashlib.sha256()
     for name, image in images.items():
@@ -184,10 +185,6 @@ def panoramas(folder: Path) -> list[str]:
     others = (*SCENE_MASKS, OVERLAY)
     names = [name for name in image_names(folder) if PurePosixPath(name).parts[0] not in MASK_FOLDERS]
     return [name for name in names if PurePosixPath(name).name not in others]
-
-
-def _scene_masks(folder: Path) -> list[str]:
-    return [name for name in image_names(folder) if PurePosixPath(name).name in SCENE_MASKS]
 
 
 def _others(folder: Path) -> tuple[str, str]:

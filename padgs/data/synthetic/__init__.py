@@ -83,9 +83,7 @@ def _depth(options: SyntheticOptions, index: int) -> torch.Tensor:
     return truth.depth(View(name, truth.exact_pose(name), options.width, options.height)).float()
 
 
-@lru_cache(maxsize=1)
-def _truth(options: SyntheticOptions) -> SyntheticTruth:
-    return SyntheticTruth(options)
+_truth = lru_cache(maxsize=1)(SyntheticTruth)
 
 
 def _make(options: SyntheticOptions) -> Stored:
