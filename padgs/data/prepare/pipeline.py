@@ -21,6 +21,7 @@ from padgs.data.assemble import IMAGE_FOLDERS, view_name
 from padgs.data.camera_paths import gravity
 from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, listed
 from padgs.data.formats import colmap
+from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
@@ -225,7 +226,7 @@ class _Job:
 
     def _write(self) -> Prepared:
         self.progress("result", 0, 1)
-        parts = map(colmap.pycolmap_module().Reconstruction, sorted((self.work / "parts").iterdir()))
+        parts = map(pycolmap_module().Reconstruction, sorted((self.work / "parts").iterdir()))
         model, *others = sorted(parts, key=lambda part: -part.num_reg_frames())
         sfm.refine(model, self.threads)
         frames, cloud, tracks = self._panoramas(model)
