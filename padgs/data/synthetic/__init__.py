@@ -83,7 +83,9 @@ def _depth(options: SyntheticOptions, index: int) -> torch.Tensor:
     return truth.depth(View(name, truth.exact_pose(name), options.width, options.height)).float()
 
 
-_truth = lru_cache(maxsize=1)(SyntheticTruth)
+@lru_cache(maxsize=1)
+def _truth(options: SyntheticOptions) -> SyntheticTruth:
+    return SyntheticTruth(options)
 
 
 def _make(options: SyntheticOptions) -> Stored:

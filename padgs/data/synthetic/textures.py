@@ -193,6 +193,29 @@ def books(uv: Array, spines: Sequence[Color], board: Color, shelf: float = 0.32)
 
 
 @texture
+def siemens_star(uv: Array, dark: Color, light: Color, spokes: int, pitch: float) -> Array:
+    """Draw a lattice of Siemens stars, `pitch` apart, one at the origin."""
+    x, y = uv / pitch - np.round(uv / pitch)
+    radius = np.hypot(x, y)
+    spoke = (np.arctan2(y, x) * (spokes / (2 * np.pi))) % 1 < 0.5
+    ring = (np.floor(radius * 60) % 2 == 0) & (radius > 0.46)
+    return mix(light, dark, np.where(radius < 0.46, spoke, ring & (radius < 0.5)).astype(np.float32))
+
+
+@texture
+def medallion(uv: Array, ground: Color, figure: Color, accent: Color, radius: float, fold: int) -> Array:
+    """Draw a round ornament of `fold`-fold symmetry: a rug on the floor, a rosette on the ceiling."""
+    r, angle = np.hypot(uv[0], uv[1]) / radius, np.arctan2(uv[1], uv[0])
+    petal = np.cos(fold * angle)
+    wave = np.sin(18 * r + 1.4 * petal) * np.cos(2 * fold * angle * np.floor(1 + 2 * r))
+    color = mix(ground, figure, step(0.15, wave, 0.25))
+    color = mix(color, accent, 1 - step(0.035, np.abs(r - 0.42 - 0.09 * petal), 0.02))
+    color = mix(color, accent, step(0.55, np.cos(4 * fold * angle), 0.2) * (np.abs(r - 0.88) < 0.05))
+    color = mix(color, figure, (np.abs(r - 0.8) < 0.012) | (np.abs(r - 0.96) < 0.015))
+    return color * (1 + 0.25 * (noise(uv[0], uv[1], 0.3) - 0.5))
+
+
+@texture
 def poster(uv: Array, sky: Color, land: Color, sun: Color, size: float) -> Array:
     """Draw a poster: a landscape of layered hills with a sun, over a line of print."""
     caption = print_of((0.93, 0.91, 0.86), (0.15, 0.13, 0.12), size / 14)

@@ -170,6 +170,8 @@ TEXTURES = {
     "stripes": tx.stripes((A, B, C)),
     "print_of": tx.print_of(B, A),
     "books": tx.books((A, B, C), C),
+    "siemens_star": tx.siemens_star(A, B, 16, 1.0),
+    "medallion": tx.medallion(A, B, C, 1.5, 8),
     "poster": tx.poster(A, B, C, 0.8),
     "window": tx.window(A, B),
     "sectors": tx.sectors((A, B), 8, 0.5),
@@ -202,6 +204,12 @@ def test_scaled_textures_have_a_higher_frequency():
     uv = np.random.default_rng(2).uniform(-1, 1, (2, 500)).astype(np.float32)
     texture = TEXTURES["bricks"]
     np.testing.assert_array_equal(tx.scaled(texture, 4.0)(uv), texture(4 * uv))
+
+
+def test_a_siemens_star_has_the_given_number_of_spokes():
+    angle = np.linspace(-np.pi, np.pi, 20_001)[:-1]
+    ring = tx.siemens_star((0, 0, 0), (1, 1, 1), 12, 1.0)(0.3 * np.stack((np.cos(angle), np.sin(angle))))[0]
+    assert (np.diff(np.append(ring, ring[0])) > 0.5).sum() == 12
 
 
 def test_framed_patches_have_the_given_position():
