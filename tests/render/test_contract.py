@@ -84,7 +84,7 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
         ({"core_size": 0}, "core_size is 0; it must be from 1 to 256"),
         ({"core_size": 257}, "core_size is 257; it must be from 1 to 256"),
         ({"core_size": 8}, "core_size is 8, but blending=sorted has no core; set blending=hybrid or core_size=16"),
-        ({"cubemap": True}, "projection 'erp' cannot render the faces of a cubemap; set projection to pinhole"),
+        ({"cubemap": True}, "projection 'erp' cannot render the faces of a cubemap; set pinhole, tangent or ray"),
     ],
 )
 def test_invalid_options_are_refused(options: dict, message: str):
@@ -116,7 +116,7 @@ def test_unknown_names_list_the_known_ones(gaussians: Gaussians):
         ("erp", "fisheye", {}, "'erp' requires a Panorama camera, not a RayTable"),
         ("pinhole", "panorama", {}, "'pinhole' requires a Pinhole camera, not a Panorama; .*or set cubemap=true"),
         ("pinhole", "fisheye", {}, "'pinhole' requires a Pinhole camera, not a RayTable"),
-        ("ray", "pinhole", {"cubemap": True}, "resampled to a Panorama, not to a Pinhole; set cubemap=false"),
+        ("ray", "pinhole", {"cubemap": True}, "a cubemap gives a Panorama, not a Pinhole; set cubemap=false"),
         ("ray", "panorama", SQUARE, "projection 'ray' has no square bounds; use bounds=exact"),
         ("tangent", "pinhole", SQUARE, "'tangent' has square bounds for a Panorama only; use .* with a Pinhole"),
         ("tangent", "fisheye", SQUARE, "use bounds=exact with a RayTable"),

@@ -218,7 +218,7 @@ def test_gradients_of_colours(generator):
         ({"polar_nodes": 9}, "polar_nodes is 9; it must be even"),
         ({"near": 0.0}, "near is 0.0"),
         ({"far": 0.06}, "far - near larger than first_radius"),
-        ({"samples_at_once": 10}, "less than the 48 of a single ray"),
+        ({"samples_at_once": 10}, "samples_at_once is 10, and a ray has 48; raise it"),
         ({"hidden": 0}, "hidden is 0; it must be at least 1"),
         ({"coarse_samples": 3}, "coarse_samples is 3 and fine_samples 24"),
     ],
