@@ -95,7 +95,8 @@ def test_methods_train_and_render_on_the_device_of_the_scene(setting, scene, tmp
     assert marks.keys() == score(here.render, scene, config.protocols, None).keys()
     list(here.fit(scene, Budget(steps + 1)))
     fresh = [float(record.loss) for record in build_method(config).fit(scene, Budget(steps))]
-    assert [float(loss) for loss in losses[:2]] == pytest.approx(fresh[:2], rel=1e-3)
+    alike = 2 if setting == "padgs_plus" else 3  # it grows after each of the first iterations of so short a run
+    assert [float(loss) for loss in losses[:alike]] == pytest.approx(fresh[:alike], rel=1e-3)
     # Later a Gaussian at a threshold may be cloned here and not there: sums of float32 differ between processors.
     assert sum(map(float, losses)) == pytest.approx(sum(fresh), rel=3e-2)
 
