@@ -63,10 +63,8 @@ def score(
 
     `camera` is that of a photograph, which is not cropped and has no metrics of latitudes and of a seam.
     """
-    rows = protocol.rows(image.shape[0])
-    if camera is not None:
-        pass
-    elif protocol.solid_angle:
+    rows = protocol.rows(image.shape[0]) if camera is None else image.shape[0]
+    if camera is None and protocol.solid_angle:
         mask = cropped_mask(mask, image, protocol)
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
