@@ -24,7 +24,8 @@ FAR = 1000.0  # largest distance of the cameras from the origin, in scene scales
 class View:
     """One image: its pose, its size, and functions that load its pixels. A panorama unless `lens` is given.
 
-    A panorama without `lens`. `load_pixels` (None: no ground truth) and `load_mask` run on every access, uncached.
+    `load_pixels` and `load_mask` are called on every access; the loader decides what is cached. A view without
+    `load_pixels` can be rendered, but has no ground truth.
     """
 
     name: str

@@ -116,9 +116,7 @@ def known_conventions() -> list[Convention]:
     corrections: dict[str, Callable[[Tensor], Tensor]] = {
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
-        "the rotations are transposed: transpose them and keep the centres": lambda p: _with(
-            p, p[:, :3, :3].mT, -p[:, :3, :3].mT @ centers(p)[..., None]
-        ),
+        "the rotations are transposed: transpose them and keep the centres": _transposed,
         "the translations are camera centres: use t = -R t": lambda p: _with(
             p, p[:, :3, :3], -p[:, :3, :3] @ p[:, :3, 3:]
         ),
@@ -148,6 +146,11 @@ def _signed_axes() -> Iterator[tuple[str, Tensor]]:
         if names == ["x", "-y", "-z"]:
             words += ", the convention of OpenGL, Blender and nerfstudio"
         yield words + (", which mirrors" if torch.linalg.det(matrix) < 0 else ""), matrix
+
+
+def _transposed(poses: Tensor) -> Tensor:
+    transposed = poses[:, :3, :3].mT
+    return _with(poses, transposed, -transposed @ centers(poses)[..., None])
 
 
 def _reordered(poses: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ class ImageFile:
 def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFile:
     """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
-    Decodes only if the header is not enough. A DataError says why not: damage, rotation, depth, shape or colours.
+    A DataError says why it is not usable: damage, rotation, several pictures, depth, shape, transparency or colours.
     Photographs of other cameras, and their masks, have any shape (`panorama` is false).
     """
     data = read_bytes(path)

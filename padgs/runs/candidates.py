@@ -110,7 +110,10 @@ def smallest(candidates: Sequence[Candidate], epsilon: float, shares: Shares) ->
 
 
 def smallest_possible(candidates: Sequence[Candidate], epsilon: float) -> Candidate:
-    """Return the smallest candidate that, with 95 % confidence, is not known to lose more than `epsilon` dB."""
+    """Return the smallest candidate that is not known to lose more than `epsilon` dB, with 95 % confidence.
+
+    From it to `smallest` is the interval of the minimal count.
+    """
     losses = ((c, differences(candidates[0].scores, c.scores, QUALITY)) for c in candidates)
     return min((c for c, own in losses if lower_bound([*own.values()]) <= epsilon), key=lambda one: one.rows)
 

@@ -86,7 +86,10 @@ class LoadedRun:
         return self.result.scores if self.result is not None else {}
 
     def renewed(self) -> LoadedRun | None:
-        """Return the run as training has left it since; None if nothing changed, or if it cannot be read now."""
+        """Return the run as training has left it since, on the same scene; None if nothing has changed.
+
+        An error that a file cannot be read may be over when a new checkpoint has been written.
+        """
         if checkpoint.digest(self.files.checkpoint) == self.digest and self.files.result() == self.result:
             return None
         run = load_run(self.folder, data_path=self.config.data.path, device=self.config.run.device)

@@ -173,7 +173,10 @@ class RunStore:
         checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint, self._run)
 
     def resume(self, method: Method, device: torch.device | str = "cpu") -> Progress:
-        """Load the checkpoint, drop later log lines, and return the progress; None without a checkpoint."""
+        """Load the checkpoint into a method and return its progress, that of a new run without one.
+
+        Log lines of later iterations are dropped, as those iterations come again; so is a line cut by a kill.
+        """
         progress = Progress()
         if self.has_checkpoint:
             state = checkpoint.load(self.checkpoint, device, self._run)
