@@ -14,7 +14,7 @@ from padgs.multirun.composition import composing, configuration, multirun
 from padgs.multirun.overrides import expand
 
 SCRIPT = Path(__file__).parents[2] / "reports" / "measure_cpu.sh"
-STEPS = ["A", "C", "D", "E", "F", "G", "J"]
+STEPS = ["A", "C", "L", "D", "E", "F", "G", "J"]
 FAKE = """#!/bin/bash
 echo "$*" >> "$CALLS"
 for setting; do case $setting in run.folder=*) runs=${setting#*=} ;; esac; done
@@ -62,7 +62,7 @@ def measure(tmp_path, monkeypatch):
 def test_the_plan_names_every_step_and_starts_nothing(measure):
     code, output, calls = measure("--plan")
     assert (code, calls) == (0, [])
-    assert all(f"{table}-" in output for table in STEPS) and "left: 25 steps, about " in output
+    assert all(f"{table}-" in output for table in STEPS) and "left: 28 steps, about " in output
 
 
 def test_finished_steps_are_skipped_and_the_tables_come_last(measure):
@@ -118,7 +118,7 @@ def test_unknown_steps_and_options_are_refused(measure):
 
 
 def test_every_command_can_be_composed_and_has_as_many_jobs_as_the_plan_says(measure):
-    _, output, calls = measure("D", "E", "F", "G", "J", "A-bedroom", "C-bedroom")
+    _, output, calls = measure("D", "E", "F", "G", "J", "A-bedroom", "C-bedroom", "L-bedroom")
     commands = {call.split(" data.path")[0].split(" +scene")[0]: call for call in calls[:-1]}
     lines = [line.split() for line in output[: output.index("left: ")].splitlines()[1:]]
     planned = {step: int(runs) for step, runs, *_ in lines}
@@ -131,5 +131,5 @@ def test_every_command_can_be_composed_and_has_as_many_jobs_as_the_plan_says(mea
             expansion = expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader)
             jobs += len(expansion)
             configuration(expansion[0])
-    scenes = ("A-bedroom", "C-bedroom", "D-bedroom", "E-bedroom", "F-bedroom", "G-builtin", "J-bedroom")
+    scenes = ("A-bedroom", "C-bedroom", "L-bedroom", "D-bedroom", "E-bedroom", "F-bedroom", "G-builtin", "J-bedroom")
     assert jobs == sum(planned[step] for step in scenes)
