@@ -15,6 +15,7 @@ from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, settings
 from padgs.reports.significance import over_scenes
 from padgs.reports.table import Cell
+from padgs.results import file_name
 
 FEWEST = 3  # methods in a chart of equal time
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
@@ -101,14 +102,26 @@ def trade_offs(run_set: RunSet) -> list[TradeOff]:
 
 
 def equal_times(run_set: RunSet) -> list[TradeOff]:
-    """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods."""
+    """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods.
+
+    The mean over the scenes of a resolution and time comes first, where there are several.
+    """
     runs, found = run_set.of_experiments("equal_time"), []
     shown = replace(run_set.request, protocol=_protocol(runs))
+    groups: dict[tuple[str, str], dict[Place, DataFrame]] = {}
     for name, title, own in sheets(runs.loc[runs["variant"] == ""], shown, "equal_time", OF_A_CHART):
-        made = _trade_off("equal_time", {own["place"].iloc[0]: own}, shown)
+        first = own.iloc[0]
+        made = _trade_off("equal_time", {first["place"]: own}, shown)
         if len({point.preset for point in made.points}) >= FEWEST:
             found.append(replace(made, name=name, title=title))
-    return found
+            groups.setdefault((first["resolution"], first["length"]), {})[first["place"]] = own
+    means = []
+    for (size, length), group in groups.items():
+        made = _trade_off("equal_time", group, shown)
+        if len(group) > 1 and made.points:
+            title = f"{made.title}, {size}, {length}"
+            means.append(replace(made, name=file_name(f"equal_time_mean_{size}_{length}"), title=title))
+    return [*means, *found]
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -144,9 +157,10 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) ->
         if any(cell.value is not None for cell in cells):
             titles = [measure.column.title for measure in measures]
             points.append(Point(setting.title, setting.preset, dict(zip(titles, cells, strict=True))))
-    what = first.title if len(group) == 1 else published.TITLES[name]
+    what = first.title if len(group) == 1 else published.TITLES.get(name, "")
     if len(group) > 1 or first.published:
-        what += f", mean over its scenes {', '.join(place.scene for place in finished)}"
+        named = ", ".join(place.scene for place in finished)
+        what = f"{what}, mean over its scenes {named}" if what else f"mean over {named}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol)
     return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes))

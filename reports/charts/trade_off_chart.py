@@ -42,6 +42,7 @@ LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line ove
 NAMED, DIP = 5, 0.5  # names in a chart over time; dB of a dip that is left out
 LINE = 90  # characters below a panel
 END_RADIUS = 2.5  # points, of the mark at the end of a run
+SPACING = 5.0  # pixels between places on a line that labels avoid
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,21 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     title = f"{trade_off.title}\nquality over training time, {meaning}"
     lay_out(made, title)
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
-    write_labels(panel, labels, ends)
+    write_labels(panel, labels, [*ends, *_along(panel)])
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, trade_off.notes)
+
+
+def _along(panel: Any) -> list[tuple[float, float, float]]:
+    """Return marks along the lines of a panel, which labels avoid."""
+    transform, marks = panel.transData, []
+    for line in panel.lines:
+        pixels = transform.transform(line.get_xydata())
+        pieces = [
+            np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / SPACING), endpoint=False) for a, b in pairwise(pixels)
+        ]
+        if pieces:
+            marks += [(x, y, END_RADIUS) for x, y in transform.inverted().transform(np.concatenate(pieces))]
+    return marks
 
 
 def _named(trade_off: TradeOff, curves: Sequence[Any], low: float, high: float) -> dict[str, str]:
