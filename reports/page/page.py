@@ -71,7 +71,9 @@ def html(run_set: RunSet) -> str:
         rows_of=rows_of,
         spans=_spans,
         maps=_charts(made["stability"]),
-        charts=_charts([*made["chart"], *made["capacity_chart"], *made["smallest_chart"]]),
+        charts=_charts(
+            [part for name in ("equal_time_chart", "chart", "capacity_chart", "smallest_chart") for part in made[name]]
+        ),
         sweeps=_charts(made["sweep"]),
         views=views,
         data=json.dumps({"images": views.images, "scenes": views.scenes}).replace("<", "\\u003c"),  # no end of script

@@ -139,6 +139,16 @@ def of_experiment(
     return replace(made, run="_".join(map(str, (name, made.scene, preset, iterations, train, options, seed))))
 
 
+def at_equal_time(*scenes: str) -> list[Result]:
+    """A run of 60 s of CPU time of three methods on each scene: 25, 26 and 27 dB, on later scenes 4 dB more each."""
+    made = []
+    for index, scene in enumerate(scenes):
+        for n, preset in enumerate(("odgs", "omnigs", "spags")):
+            one = of_experiment("equal_time", 25.0 + n + 4 * index, preset=preset, scene=scene)
+            made.append(replace(one, config={**one.config, "budget": {"seconds": 60.0, "clock": "cpu"}}))
+    return made
+
+
 def budgets(psnr: dict[tuple[str, int], float]) -> list[Result]:
     """Two runs of `capacity` for each method and limit, with this PSNR and 0.1 dB more."""
     made = []

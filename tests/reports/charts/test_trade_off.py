@@ -3,7 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.made_up import METHODS, assert_apart, compared, data_set, of_experiment, run_set, small, write
+from support.made_up import METHODS, assert_apart, at_equal_time, compared, data_set, run_set, small, write
 
 from padgs.reports import store
 from padgs.reports.charts import trade_off_chart
@@ -88,28 +88,14 @@ def test_a_chart_names_its_marks_and_axes():
 
 
 def test_after_equal_time_only_the_time_per_frame_is_a_cost():
-    budget = {"seconds": 60.0, "clock": "cpu"}
-    runs = [
-        replace(run := of_experiment("equal_time", 25.0, preset=method), config=run.config | {"budget": budget})
-        for method in ("odgs", "omnigs", "spags")
-    ]
+    runs = at_equal_time("synthetic-room")
     (made,) = equal_time_charts(run_set(runs))
     assert made.name == "equal_time_synthetic-room_512x256_60-s-of-CPU-time" and len(made.figure.axes) == 1
     assert ">time per frame, ms ↓<" in made.svg and equal_time_charts(run_set(runs[:2])) == []
 
 
 def test_the_mean_over_scenes_after_equal_time_comes_first():
-    budget = {"seconds": 60.0, "clock": "cpu"}
-    runs = [
-        replace(
-            run := of_experiment(
-                "equal_time", 25.0 + n + 4 * (scene == "synthetic-outdoor"), preset=method, scene=scene
-            ),
-            config=run.config | {"budget": budget},
-        )
-        for scene in ("synthetic-room", "synthetic-outdoor")
-        for n, method in enumerate(("odgs", "omnigs", "spags"))
-    ]
+    runs = at_equal_time("synthetic-room", "synthetic-outdoor")
     mean, *scenes = equal_times(run_set(runs))
     assert mean.name == "equal_time_mean_512x256_60-s-of-CPU-time" and len(scenes) == 2
     assert mean.title == "mean over synthetic-outdoor, synthetic-room, 512x256, 60 s of CPU time"

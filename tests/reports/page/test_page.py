@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 from support.chromium import in_chromium, visiting
-from support.made_up import compared, data_set, failed, run_set, small, swept, write
+from support.made_up import at_equal_time, compared, data_set, failed, run_set, small, swept, write
 
 from padgs.reports import store
 from padgs.reports.frame import frame
@@ -36,6 +36,11 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
         assert words in html
     assert "26.02" not in html, "numbers of the paper where nothing of ours stands beside them"
     assert html.count('<figure class="chart"') == 3
+
+
+def test_the_mean_after_equal_time_is_the_first_chart():
+    html = page.html(run_set(at_equal_time("synthetic-room", "synthetic-outdoor")))
+    assert "mean over synthetic-outdoor, synthetic-room" in html.partition('<figure class="chart"')[2][:2000]
 
 
 def test_names_are_text_and_not_markup():
