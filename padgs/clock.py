@@ -107,12 +107,17 @@ def peak_memory(device: Device = "cpu") -> dict[str, Any]:
     return {"peak_memory_bytes": 1024 * kilobytes or other, "peak_device_memory_bytes": on_device}
 
 
+def cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def machine(device: Device = "cpu") -> dict[str, Any]:
     """Return hardware, versions, code and date, which a measurement is read with."""
     gpu = torch.device(device) if torch.device(device).type == "cuda" else None
     return {
         "cpu": _linux("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": cores(),
         "threads": torch.get_num_threads(),
         "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         "gpu": torch.cuda.get_device_name(gpu) if gpu else None,

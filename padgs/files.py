@@ -138,7 +138,8 @@ def _format_of(file: Path | IO[bytes]) -> str:
     from PIL import Image
 
     if isinstance(file, Path):
-        start = file.read_bytes()[:64]
+        with file.open("rb") as opened:
+            start = opened.read(64)
     else:
         file.seek(0)
         start = file.read(64)

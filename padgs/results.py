@@ -138,6 +138,19 @@ PICTURES = "renders"  # folder of images: ground truth | render | error of each 
 SMALLEST_PICTURE = "smallest.png"  # ground truth | full model | smallest model for each loss of `SMALLEST_PICTURED`
 
 
+def flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted key and value of nested mappings.
+
+    >>> dict(flat({"seed": 1, "data": {"width": 64}}))
+    {'seed': 1, 'data.width': 64}
+    """
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{where}{key}.")
+        else:
+            yield f"{where}{key}", value
+
+
 def log_lines(run_folder: Path) -> Iterator[dict[str, Any]]:
     """Yield the complete lines of a run's log, each with its `iteration`; a missing log has no lines."""
     try:

@@ -20,7 +20,7 @@ from padgs.checks import printable
 from padgs.reports.methods import EXTERNAL
 from padgs.reports.published import Place
 from padgs.reports.store import Run
-from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, picture_name
+from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, flat, picture_name
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
@@ -52,7 +52,7 @@ def row_of(run: Run) -> tuple[dict[str, Any], ...]:
     numbers = {name: None if (value := of(result)) is None else float(value) for name, of in NUMBERS.items()}
     facts = {name: of(result) for name, of in FACTS.items()}
     metrics = {f"{name}/{metric}": value for name, of in result.scores.items() for metric, value in of.metrics.items()}
-    return facts, dict(_rules(result)), metrics, numbers, dict(_flat(result.config))
+    return facts, dict(_rules(result)), metrics, numbers, dict(flat(result.config))
 
 
 def _cleaned(result: Result) -> Result:
@@ -243,15 +243,6 @@ def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
     return found
 
 
-def _flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and values."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{where}{key}.")
-        else:
-            yield f"{where}{key}", value
-
-
 def _training_seconds(result: Result) -> float | None:
     """Return the training time of the device that trained: CPU time of the process, or wall time on a GPU."""
     wall = result.timing.get("train_seconds")
@@ -278,7 +269,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "hardware": _hardware,
     "machine": _machine,
     "setting": lambda result: json.dumps(
-        {key: value for key, value in _flat(result.config) if decides(key)}, sort_keys=True
+        {key: value for key, value in flat(result.config) if decides(key)}, sort_keys=True
     ),
     "smallest": lambda result: _searched(result.smallest),
     "view_psnr": lambda result: _view_psnr(result.scores),

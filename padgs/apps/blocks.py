@@ -66,7 +66,7 @@ def bisect(affinity: np.ndarray, members: np.ndarray, count: int) -> list[np.nda
     best: tuple[float, int, int] | None = None
     for first in {count // 2, count - count // 2}:
         share = len(members) * first / count
-        low, high = math.ceil(share * (1 - SLACK)), math.floor(share * (1 + SLACK))
+        low, high = math.floor(share * (1 - SLACK)), math.ceil(share * (1 + SLACK))
         for cut in range(max(low, first), min(high, len(members) - count + first) + 1):
             between = part[:cut, cut:].sum()
             cost = between / degree[:cut].sum() + between / degree[cut:].sum()

@@ -35,7 +35,7 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering
-from padgs.results import CONFIG_NAME, Result, picture_name
+from padgs.results import CONFIG_NAME, LONGEST_NAME, Result, picture_name
 from padgs.runs.config import BudgetOptions, DataConfig, RunConfig, TrainConfig, choose_device
 from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import initial_result, load_scene
@@ -89,15 +89,15 @@ def is_splat_file(path: str) -> bool:
 def config_of(data: str, render: RenderConfig | None = None, device: str = "auto", **settings: Any) -> RunConfig:
     """Return the configuration of a data set: a folder with keys of the `data` group, or a run, whose data it is."""
     given = {name: value for name, value in settings.items() if value}
+    usual = {name: PROTOCOLS[name] for name in ("paper", "sphere")}
     if not (Path(data) / CONFIG_NAME).is_file():
-        protocols = {name: PROTOCOLS[name] for name in ("paper", "sphere")}
         group = DataConfig(path=data, **{"format": "auto", **given})
-        config = RunConfig(data=group, method=METHOD, options=ExternalOptions(), protocols=protocols)
+        config = RunConfig(data=group, method=METHOD, options=ExternalOptions(), protocols=usual)
     elif given:
         raise ValueError(f"--data {data} is a run, which has its own data settings; leave out --{next(iter(given))}")
     else:
         config = load_run(data, device="cpu").config
-        protocols = {name: rules for name, rules in config.protocols.items() if name != STABILITY}
+        protocols = {name: rules for name, rules in config.protocols.items() if name != STABILITY} or usual
         config = replace(config, method=METHOD, options=ExternalOptions(), protocols=protocols, labels=Labels())
         config = replace(config, train=TrainConfig(), budget=BudgetOptions(), init=None, variant="", seed=0)
     return replace(config, render=render or RenderConfig(), run=replace(config.run, device=device))
@@ -279,6 +279,8 @@ def score_external(
     name = re.sub(r"[^A-Za-z0-9]+", "-", label).strip("-")[:40].lower()
     if not name:
         raise ValueError(f"--label {label!r} has no letter of A to Z and no digit; name the program")
+    if len(label) > LONGEST_NAME:
+        raise ValueError(f"--label has {len(label)} letters; give at most {LONGEST_NAME}")
     if not scene.test:
         raise ValueError(f"{scene.name} has no test views to score; add --split every")
     config = replace(config, labels=Labels(name), run=replace(config.run, folder=str(runs)))

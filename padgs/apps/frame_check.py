@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
 from padgs.evaluation.metrics import mean_color, sphere_weight, ws_psnr
+from padgs.evaluation.scoring import ONE_COLOR
 from padgs.geometry.similarity import Similarity
 from padgs.render import Rendering
 from padgs.scene import Scene, View
@@ -123,6 +125,10 @@ def check_frame(
     if not views:
         return FrameCheck(float("inf"), 0.0)
     truths = [_small(view) for view in views]
+    constants = [mean_color(truth, sphere_weight(truth, mask)).item() for _, truth, mask in truths]
+    if not (compared := [index for index, constant in enumerate(constants) if constant < ONE_COLOR]):
+        return FrameCheck(float("inf"), 0.0)
+    truths, flat = [truths[index] for index in compared], mean(constants[index] for index in compared)
 
     def quality(scene_from_file: Similarity, count: int = VIEWS) -> float:
         marks = [
@@ -131,7 +137,6 @@ def check_frame(
         ]
         return torch.stack(marks).mean().item()
 
-    flat = torch.stack([mean_color(truth, sphere_weight(truth, mask)) for _, truth, mask in truths]).mean().item()
     found = FrameCheck(quality(Similarity()), flat)
     if found.psnr >= flat + MARGIN or not len(means):
         return found

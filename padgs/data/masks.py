@@ -97,7 +97,7 @@ def find_masks(
         notes.append(f"mask: rows from {keep} of {of} on are ignored ({1 - keep / of:.1%} of the image)")
         rows = {height: row_weights(keep, of, height) for _, height in sizes}
         for weights in rows.values():
-            _refuse_hidden(weights, f"data.mask={spec} hides {{}} of each image; keep more rows")
+            _refuse_hidden(weights, f"data.mask={spec} hides ", " of each image; keep more rows")
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
@@ -106,7 +106,7 @@ def find_masks(
         path, fixed = files.get(frame.name), rows.get(height) if frame.lens is None else None
         if image.crop is not None:
             fixed = crop_weights(image.crop, width, height) * (1 if fixed is None else fixed)
-            _refuse_hidden(fixed, f"the crop of {image.path} hides {{}}; remove that image")
+            _refuse_hidden(fixed, f"the crop of {image.path} hides ", "; remove that image")
         if path is None:
             masks.append(None if fixed is None else Mask(None, fixed))
             continue
@@ -120,8 +120,8 @@ def find_masks(
             )
         mask = Mask(StoredImage(path, width, height, store, "L"), fixed, inverted ^ path.name.startswith(INVERTED))
         if mask.file not in shown:
-            hides = f"{path} hides {{}} of {frame.name}; in a mask 255 means use, 0 means ignore; {_INVERT}"
-            shown[mask.file] = _refuse_hidden(mask(), hides)
+            rule = f" of {frame.name}; in a mask 255 means use, 0 means ignore; {_INVERT}"
+            shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule)
         masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}{':inverted' * mask.inverted}")
     if (median(shown.values()) if shown else 1) < 1 - MAX_HIDDEN:
@@ -151,14 +151,17 @@ def mask_path(spec: str, folder: Path) -> Path | None:
     return given
 
 
-def _refuse_hidden(weights: Tensor, message: str) -> float:
-    """Return the share of the sphere that weights [H, W or 1] show; refuse less than `MIN_VISIBLE`."""
+def _refuse_hidden(weights: Tensor, what: str, way_out: str) -> float:
+    """Return the share of the sphere that weights [H, W or 1] show; refuse less than `MIN_VISIBLE`.
+
+    The message says how much is hidden between `what` and `way_out`.
+    """
     area = solid_angle_weight(len(weights))
     # The mean weight, not the share of non-zero pixels: a mask with 1 in place of 255 hides nearly everything.
     shown = (weights.mean(-1).cpu() @ area / area.sum()).item()
     if shown < MIN_VISIBLE:
         much = f"all but {shown:.2%} of the sphere" if shown else "every pixel"
-        raise DataError(message.format(much))
+        raise DataError(what + much + way_out)
     return shown
 
 

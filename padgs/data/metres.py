@@ -195,7 +195,8 @@ def gps_of(image: Path) -> tuple[float, float, float] | None:
         tags = opened.getexif().get_ifd(ExifTags.IFD.GPSInfo)
     try:
         angles = [
-            sum(float(part) / 60**k for k, part in enumerate(tags[value])) * (-1 if str(tags[side])[:1] in "SW" else 1)
+            sum(float(part) / 60**k for k, part in enumerate(tags[value]))
+            * (-1 if str(tags[side])[:1] in {"S", "W"} else 1)
             for value, side in (
                 (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef),
                 (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef),

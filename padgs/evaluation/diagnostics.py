@@ -94,14 +94,20 @@ def yaw_error(render: Callable[[View], Rendering], view: View, image: Tensor) ->
     return (back.roll(view.width // 2, dims=1) - image).abs().max()
 
 
-def diagnose(render: Callable[[View], Rendering], view: View, rendering: Rendering) -> dict[str, float | None]:
-    """Return yaw and depth diagnostics of a panorama; None if the view has no ground truth for it."""
+def diagnose(
+    render: Callable[[View], Rendering], view: View, rendering: Rendering, mask: Tensor | None = None
+) -> dict[str, float | None]:
+    """Return yaw and depth diagnostics of a panorama; None without measured depth, for yaw at an odd width.
+
+    Depth counts where the mask [H, W] is above 0.
+    """
     names = ("yaw_error", "depth_error", "depth_within", "floaters", "least_extent")
     metrics: dict[str, float | None] = dict.fromkeys(names)
     if view.width % 2 == 0:
         metrics["yaw_error"] = yaw_error(render, view, rendering.image).item()
     if view.load_depth is not None and not view.depth_is_relative:
         depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
+        truth = truth if mask is None else torch.where(mask > 0, truth, 0.0)
         metrics["depth_error"] = finite_or_none(depth_error(depth, truth))
         metrics["depth_within"] = finite_or_none(depth_within(depth, truth))
         metrics["floaters"] = finite_or_none(floaters(depth, 1 - rendering.transmittance, truth))

@@ -135,6 +135,6 @@ def checked(image: Tensor, view: View) -> Tensor:
 
 
 def finite_or_none(metric: Tensor) -> float | None:
-    """Return a metric as a number; None if no pixel has a weight."""
+    """Return a metric as a number; None for NaN: no weighted pixel, or 0 / 0 such as `seam` of an exact render."""
     value = metric.item()
-    return None if value != value else value  # images are finite, so only weights that sum to 0 give NaN
+    return None if value != value else value

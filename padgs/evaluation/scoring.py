@@ -26,6 +26,7 @@ from padgs.results import Scores
 from padgs.scene import Scene, View
 
 POLAR = 85.0  # degrees
+ONE_COLOR = 60.0  # dB between a view, such as a black frame of a video, and its mean colour
 STABILITY = "stability"  # the protocol with more than image metrics
 TIMED_VIEWS, REPEATS = 4, 5  # of the frame times
 Render = Callable[[View], Rendering]
@@ -66,23 +67,24 @@ def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView
         if (blurred := oracle(image, truth, mask)) is not None:
             marks["pole_gap_oracle"] = pole_gap(blurred, truth, mask)
         marks = {"pole_gap_oracle": None, **{name: finite_or_none(mark) for name, mark in marks.items()}}
-        return {**marks, **diagnose(render, view, rendering)}
+        return {**marks, **diagnose(render, view, rendering, mask)}
 
     scores = evaluate(render, scene.test, protocol, on_view=on_view, extra=more)
     training = scene.train[:: max(1, len(scene.train) // len(scene.test))]
-    ws_psnr = evaluate(render, training, protocol).metrics["ws_psnr"]
+    ws_psnr = evaluate(render, training, protocol).metrics.get("ws_psnr")
     return replace(scores, metrics={**scores.metrics, "ws_psnr_training": ws_psnr})
 
 
-def constant_color_quality(scene: Scene, protocol: Protocol) -> float:
-    """Return the mean WS-PSNR (dB) of test views that are replaced by their mean colour."""
+def constant_color_quality(scene: Scene, protocol: Protocol) -> dict[str, float]:
+    """Return the WS-PSNR (dB) of test views that are replaced by their mean colour, without those that have one."""
 
     def quality(view: View) -> float:
         truth, mask = view.image(), view.mask()
         mask = mask if view.lens is not None else cropped_mask(mask, truth, protocol)
         return mean_color(truth, angle_weight(truth, mask, view.lens)).item()
 
-    return sum(map(quality, scene.test)) / len(scene.test)
+    found = {view.name: quality(view) for view in scene.test}
+    return {name: value for name, value in found.items() if value < ONE_COLOR}
 
 
 def probe(render: Render, view: View) -> dict[str, float]:

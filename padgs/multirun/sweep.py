@@ -192,9 +192,10 @@ class Multirun:
                 launcher.launch(jobs, initial_job_idx=first_number)
                 return None
             display = Display(self._console, redraw=0.0, line=SECONDS_BETWEEN_LINES)
-            with Interrupt() as stop, display, repeated(lambda: self._tick(stop, display)):
+            with Interrupt() as stop, display:
                 try:
-                    launch(launcher, jobs, first_number, self.board)
+                    with repeated(lambda: self._tick(stop, display)):
+                        launch(launcher, jobs, first_number, self.board)
                 finally:  # a closed terminal ends workers that are still being imported, too
                     self._tick(stop, display)
         except Exception as error:

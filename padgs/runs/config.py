@@ -1,6 +1,5 @@
 """The configuration of a run. Its keys are the fields of dataclasses; the files in `conf/` only override defaults."""
 
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -10,6 +9,7 @@ import torch
 
 from padgs.baselines import METHODS
 from padgs.checks import ConfigError, Key, check, check_known, lookup, typed, unknown
+from padgs.clock import cores
 from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
@@ -114,8 +114,7 @@ class RunOptions:
         """Threads of one run, so that all jobs together use the cores of this process; None: torch's default."""
         if self.threads is not None or self.jobs == 1:
             return self.threads
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return max(1, cores // self.jobs)
+        return max(1, cores() // self.jobs)
 
 
 @dataclass(frozen=True)

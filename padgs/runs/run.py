@@ -270,10 +270,13 @@ def judge(result: Result, scene: Scene, iterations: int) -> Result:
     metrics: dict[str, float | None] = {}
     for scores in result.scores.values():
         metrics |= scores.metrics
-        quality = scores.metrics.get("ws_psnr")
-        if quality is None or iterations < MIN_ITERATIONS:
+        known = {name: view["ws_psnr"] for name, view in scores.views.items() if view.get("ws_psnr") is not None}
+        if not known or iterations < MIN_ITERATIONS:
             continue
-        if quality < (constant := constant_color_quality(scene, Protocol(**scores.protocol))):
+        constants = constant_color_quality(scene, Protocol(**scores.protocol))
+        compared = [name for name in constants if name in known]
+        quality, constant = (sum(of[name] for name in compared) / max(1, len(compared)) for of in (known, constants))
+        if quality < constant:
             reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {constant:.2f} dB"
             return replace(result, status="diverged", reason=reason)
     depth, thickness, reason = metrics.get("depth_error"), metrics.get("least_extent"), ""

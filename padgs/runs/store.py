@@ -115,7 +115,7 @@ class RunStore:
 
     @property
     def is_busy(self) -> bool:
-        """True if another process holds the lock."""
+        """True if another process holds the lock, or the folder cannot be locked from here."""
         try:
             self._lock.acquire(timeout=0)
         except OSError:  # a `Timeout`, or a folder that cannot be locked from here

@@ -7,13 +7,12 @@ database, so it is imported when the first run has ended.
 import importlib.util
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
-from omegaconf import OmegaConf
 
 from padgs import results
 from padgs.checks import check_known, install_command
@@ -121,8 +120,7 @@ class Tracker:
         tags = {f"padgs.{key}": value[:LONGEST_VALUE] for key, value in words.items()}
         tags |= {RUN: run.name} | ({PARENT: self._parent} if self._parent else {})
         identity = self._create(run.name, tags)
-        config: Any = OmegaConf.to_container(OmegaConf.load(run / results.CONFIG_NAME))
-        params = [Param(key, str(value)[:LONGEST_VALUE]) for key, value in flat(config)]
+        params = [Param(key, str(value)[:LONGEST_VALUE]) for key, value in results.flat(result.config)]
         for start in range(0, len(params), MOST_PARAMS):
             self._client.log_batch(identity, params=params[start : start + MOST_PARAMS])
         now = int(1000 * time.time())
@@ -137,7 +135,7 @@ class Tracker:
         numbers |= {name: getattr(result, name) for name in ("peak_memory_bytes", "peak_device_memory_bytes")}
         metrics += [
             Metric(key.replace(".", "/"), float(value), now, result.iterations_done)
-            for key, value in flat(numbers)
+            for key, value in results.flat(numbers)
             if value is not None
         ]
         for start in range(0, len(metrics), MOST_METRICS):
@@ -146,16 +144,3 @@ class Tracker:
         self._client.log_artifact(identity, str(run / results.FILE_NAME))
         self._client.set_terminated(identity, "FINISHED" if result.ok else "FAILED")
         self._client.set_tag(identity, FINISHED, mark)
-
-
-def flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted key and value of nested mappings.
-
-    >>> dict(flat({"seed": 1, "data": {"width": 64}}))
-    {'seed': 1, 'data.width': 64}
-    """
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{where}{key}.")
-        else:
-            yield f"{where}{key}", value

@@ -118,7 +118,7 @@ def draw(
 def time_chart(trade_off: TradeOff) -> Chart | None:
     """Return held-out PSNR over training seconds, with a label where a run ends; None if no run has a log.
 
-    The axis of quality shows the later halves of the runs (`axis.window`) and the best of each. Releases are dashed.
+    The axis of quality shows the later halves of the runs (`drawing.window`) and the best of each. Releases are dashed.
     `NAMED` methods have a colour and a name at their best setting; dips after resets of opacities are left out.
     """
     curves = _curves(trade_off)

@@ -75,6 +75,15 @@ def test_groups_that_share_little_are_clusters(sizes):
     ]
 
 
+def test_few_nodes_are_divided_however_they_hang_together():
+    random = np.random.default_rng(0)
+    for size in range(2, 13):
+        for count in range(1, size // 2 + 1):
+            shared = random.random((size, size)) ** 8 + 1e-6
+            found = bisect(shared + shared.T, np.arange(size), count)
+            assert len(found) == count and sorted(np.concatenate(found).tolist()) == [*range(size)]
+
+
 def test_tracks_say_what_a_camera_sees():
     frames = tuple(Frame(f"{name}.png", Path(), torch.eye(4)) for name in "ab")
     tracks = Tracks(torch.tensor([0, 1, 1]), torch.tensor([2, 0, 1]), torch.zeros(3, 2))

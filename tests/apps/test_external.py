@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 
 import padgs
 from padgs import results
+from padgs.apps import external
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
@@ -22,6 +24,7 @@ from padgs.apps.frame_check import _closest_points, as_numbers, read_transform
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
+from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry.similarity import Similarity
 from padgs.methods.splats.splats import Splats
 
@@ -63,6 +66,20 @@ def test_gaussians_are_scored_like_a_run(run, splats, tmp_path):
     assert found.external == {"program": "Brush", "version": "0.3.1", "label": "Other Program"}
     assert (found.method, found.preset, found.fingerprint) == ("external", "other-program", opened.result.fingerprint)
     assert found.counts["gaussians"] == 1500 and "render_ms_min" in found.timing
+
+
+def test_a_run_that_was_only_stressed_lends_its_data_and_not_its_protocol(run, monkeypatch):
+    opened = padgs.load_run(run, device="cpu")
+    config = replace(opened.config, protocols={"stability": PROTOCOLS["stability"]})
+    monkeypatch.setattr(external, "load_run", lambda *_, **__: replace(opened, config=config))
+    assert external.config_of(str(run)).protocols.keys() == {"paper", "sphere"}
+
+
+def test_suffixes_may_be_capitals(splats, tmp_path):
+    capitals = shutil.copy(splats, tmp_path / "A.PLY")
+    assert len(read_splats(Path(capitals))) == 1500
+    with pytest.raises(ValueError, match=r"not a readable|splat-transform"):
+        read_splats(Path(shutil.copy(splats, tmp_path / "A.SPZ")))
 
 
 def test_renders_in_a_folder_score_like_their_run(run, tmp_path):
@@ -189,6 +206,10 @@ def test_wrong_input_is_refused(run, splats, tmp_path):
         (("score", splats, "--data", run, "--width", "64"), "leave out --width"),
         (("score", splats, "--data", tmp_path / "gone"), "gone"),
         (("score", splats, "--data", run, "--label", "…", "--to", tmp_path), "has no letter of A to Z"),
+        (
+            ("score", splats, "--data", run, "--label", 256 * "a", "--to", tmp_path),
+            "--label has 256 letters; give at most",
+        ),
         (("score", tmp_path, "--data", run, "--rays", "ewa"), "--transform and --rays belong to Gaussians"),
         (("render", run, "--rays", "ewa"), "leave out --rays and --transform"),
     ):

@@ -117,6 +117,10 @@ def test_masks_that_hide_almost_everything_are_refused(folder: Path) -> None:
     Image.fromarray(mask).save(folder / "pixel.png")
     with pytest.raises(DataError, match=r"pixel.png hides all but 0.08% of the sphere of pano_00.png; in a mask 255"):
         load(folder, mask="pixel.png")
+    (folder / "{a} {}").mkdir()
+    (folder / "pixel.png").rename(folder / "{a} {}" / "{b}.png")
+    with pytest.raises(DataError, match=r"\{a\} \{\}/\{b\}.png hides all but 0.08% of the sphere of pano_00.png; in a"):
+        load(folder, mask="{a} {}/{b}.png")
     with pytest.raises(DataError, match=r"data.mask=rows:1/32 hides all but 0.24% of the sphere of each image; keep"):
         load(folder, mask="rows:1/32")
 

@@ -85,6 +85,17 @@ def test_diagnostics_without_ground_truth_are_missing():
     assert known["least_extent"] == pytest.approx(1) and metrics["least_extent"] is None
 
 
+def test_hidden_pixels_have_no_depth():
+    view, mask = tiny_scene().test[0], torch.zeros(16, 32)
+    mask[:8] = 1
+    wrong = torch.where(mask > 0, SURFACE, 0.5 * SURFACE)  # a floater below
+    rendering = Rendering(torch.zeros(16, 32, 3), torch.zeros(16, 32), wrong, torch.ones(1, dtype=torch.bool))
+    known = diagnose(lambda _: rendering, replace(view, load_depth=lambda: SURFACE), rendering, mask)
+    assert (known["depth_error"], known["depth_within"], known["floaters"]) == (0, 1, 0)
+    assert known["least_extent"] == pytest.approx(1)
+    assert diagnose(lambda _: rendering, replace(view, load_depth=lambda: SURFACE), rendering)["depth_error"] > 0.2
+
+
 def test_mean_color_is_weighted_by_solid_angle():
     target = torch.zeros(16, 32, 3)
     target[:8] = 1.0

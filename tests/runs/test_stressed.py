@@ -73,6 +73,11 @@ def test_rates_a_thousand_times_as_high_never_end_well(run, method):
     assert made.status not in ("ok", "rejected") and made.reason in said.replace("\n", " ")
 
 
+def test_a_protocol_may_ask_for_less(run):
+    marks = run("protocol.stability.metrics=[seam]")[0].scores["stability"].metrics
+    assert marks["seam"] > 0 and marks["ws_psnr_training"] is None and "ws_psnr" not in marks
+
+
 def test_wrong_depths_are_degenerate(run, monkeypatch):
     monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: with_depth(0.3))
     made, said = run()
@@ -94,10 +99,14 @@ def test_wrong_depths_are_degenerate(run, monkeypatch):
 def test_results_are_judged_by_what_they_show(better, depth_error, least_extent, iterations, status):
     """Worse than one colour, under any protocol; depths where they are known."""
     scene, protocol = tiny_scene(), Protocol("half", ("ws_psnr",), "none", "11", solid_angle=True, bottom_crop=0.5)
+    black = replace(scene.test[0], name="black", load_pixels=lambda: torch.zeros(16, 32, 3, dtype=torch.uint8))
+    scene = replace(scene, test=(*scene.test, black))
     one_color = constant_color_quality(scene, protocol)
+    assert one_color.keys() == {view.name for view in scene.test} - {"black"}, "its own colour has endless decibels"
     assert one_color != constant_color_quality(scene, replace(protocol, bottom_crop=0.0))
-    marks = {"ws_psnr": one_color + better, "depth_error": depth_error, "least_extent": least_extent}
-    made = replace(result(), scores={"half": Scores(asdict(protocol), marks, {})})
+    views = {name: {"ws_psnr": value + better} for name, value in one_color.items()} | {"black": {"ws_psnr": 30.0}}
+    marks = {"ws_psnr": 30.0, "depth_error": depth_error, "least_extent": least_extent}
+    made = replace(result(), scores={"half": Scores(asdict(protocol), marks, views)})
     assert judge(made, scene, iterations).status == status
     assert judge(replace(made, status="timeout"), scene, iterations).status == "timeout"
     assert judge(result(), scene, iterations).ok, "without marks"

@@ -21,7 +21,6 @@ def make_run(runs: Path, name: str = "room_padgs_1", *, status: str = "ok") -> P
     run = runs / name
     (run / "renders").mkdir(parents=True)
     (run / "renders" / "000.png").write_bytes(b"a picture")
-    (run / "config.yaml").write_text("method: {name: padgs, tau: 0.9}\nseed: 0\n")
     lines = ({"iteration": n, "loss": 1 / n, "events": ["x"]} for n in range(10, 31, 10))
     (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     machine = {"cpu": "a processor", "cores": 2, "torch": "2.13.0", "gpu": None}
@@ -29,7 +28,8 @@ def make_run(runs: Path, name: str = "room_padgs_1", *, status: str = "ok") -> P
     result = Result(
         run=name, status=status, method="padgs", preset="padgs", variant="", dataset="synthetic", scene="room",
         width=64, height=32, iterations=30, iterations_done=30, seed=0, code_version="0", machine=machine,
-        config_hash="", fingerprint="", finished="", scores=marks, counts={"anchors": 5}, experiments=("tau",),
+        config_hash="", fingerprint="", finished="", config={"method": {"name": "padgs", "tau": 0.9}, "seed": 0},
+        scores=marks, counts={"anchors": 5}, experiments=("tau",),
     )  # fmt: skip
     results.write(result, run)
     return run

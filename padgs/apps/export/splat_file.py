@@ -37,7 +37,7 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
     `comments` are of a PLY header, `start` [2, 3] is the initial position and target of the viewer in an .html.
     """
     check_suffix(path)
-    if not path.name.endswith(CONVERTED):
+    if not path.name.lower().endswith(CONVERTED):
         _write_ply(path, splats, comments)
         return
     with draft_of(path.with_name(f"{path.name}-parts")) as folder:  # as large as the model
@@ -45,7 +45,7 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
         plain = folder / "splats.ply"
         _write_ply(plain, splats, comments)
         settings = []
-        if start is not None and path.suffix == ".html":
+        if start is not None and path.suffix.lower() == ".html":
             (folder / "viewer.json").write_text(json.dumps(_viewer_settings(start)))
             settings = ["--viewer-settings", str(folder / "viewer.json")]
         _convert(plain, path, *settings)
@@ -70,9 +70,9 @@ def _convert(source: Path, target: Path, *more: str) -> None:
 
 def check_suffix(path: Path) -> None:
     """Raise a ValueError early for an unknown suffix, or if the converter that it needs is not installed."""
-    if not path.name.endswith((".ply", *CONVERTED)):
+    if not path.name.lower().endswith((".ply", *CONVERTED)):
         raise ValueError(f"{path} has an unknown format; known: .ply, {', '.join(CONVERTED)}")
-    if path.name.endswith(CONVERTED) and shutil.which(CONVERTER) is None:
+    if path.name.lower().endswith(CONVERTED) and shutil.which(CONVERTER) is None:
         raise ValueError(
             f"writing {path.name} needs {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
             "or write a .ply, which most viewers read"
@@ -84,7 +84,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
 
     A DataError says that a PLY holds no Gaussians, a ValueError that the converter is not installed or fails.
     """
-    if path.name.endswith(CONVERTED):
+    if path.name.lower().endswith(CONVERTED):
         check_suffix(path)
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "splats.ply"

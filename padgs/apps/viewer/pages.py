@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
 from io import BytesIO
 from typing import Any
 
@@ -74,7 +75,7 @@ class Page:
         self._views = {view.name: view for view in (*scene.train, *scene.test)}
         gui = client.gui
         gui.add_markdown(HELP)
-        self._summary = gui.add_markdown("rendering the first image")
+        self._summary = gui.add_html("rendering the first image")
         self._camera = gui.add_dropdown("camera", CAMERAS)
         layers = tuple(layer for layer in LAYERS if layer != "error" or scene.train[0].load_pixels is not None)
         self._layer = gui.add_dropdown("show", layers)
@@ -199,7 +200,7 @@ class Page:
             except Exception as error:  # of any method; shown on the page, which continues
                 if self._closed.is_set():
                     return
-                self._summary.content = f"**{type(error).__name__}**: {error}"
+                self._summary.content = f"<b>{type(error).__name__}</b>: {escape(str(error), quote=False)}"
                 continue
             if not full:
                 change = (FRAME_SECONDS / max(seconds, 1e-3)) ** 0.5
@@ -223,7 +224,9 @@ class Page:
             text = f"{1000 * seconds:.0f} ms, {image.shape[1]}x{image.shape[0]}"
             if state.options.layer == "error":
                 text += f"; error of {state.renderers[0].nearest(state.cam_from_world).name}"
-            self._summary.content = "  \n".join((*(renderer.summary for renderer in state.renderers), text))
+            # Names and errors come from other people's files.
+            lines = [escape(line, quote=False) for line in (*(one.summary for one in state.renderers), text)]
+            self._summary.content = "<br>".join(lines)
         return seconds
 
 

@@ -99,11 +99,11 @@ def _frame(image: Any, where: str, folder: Path, name: str) -> Frame | None:
 
 
 def _write_blob(blob: Any, path: Path) -> None:
-    if path.is_file() and path.stat().st_size == blob.byteCount():
-        return
     data = np.zeros(blob.byteCount(), np.uint8)
     blob.read(data, 0, len(data))
     try:
+        if path.is_file() and path.read_bytes() == data.tobytes():  # the folder may be read-only
+            return
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, data.tobytes())
     except OSError as error:

@@ -79,9 +79,13 @@ def write_transforms(content: Content, folder: Path) -> None:
 def write_openmvg(content: Content, folder: Path) -> None:
     """Write `sfm_data.json`, colorized.ply for the colours, and the lists."""
     views, extrinsics = _mvg_views(content)
-    width, height = _size(content.frames[0])
-    cereal = {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
-    intrinsic = {"id": 2147483649, "data": {"value0": {"width": width, "height": height}}}
+    intrinsics = []
+    for key, (width, height) in enumerate(_sizes(content)):
+        # As cereal writes it: only the first object of a type has its name, and pointers are numbered throughout.
+        kind = {"polymorphic_id": 1} if key else {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
+        data = {"value0": {"width": width, "height": height}}
+        wrapper = {"id": 2147483650 + len(views) + key, "data": data}
+        intrinsics.append({"key": key, "value": {**kind, "ptr_wrapper": wrapper}})
     cloud, tracks = content.cloud or Cloud(torch.zeros(0, 3), None), content.tracks or Tracks.from_observations([])
     structure = [
         {"key": key, "value": {"X": point, "observations": []}} for key, point in enumerate(cloud.points.tolist())
@@ -96,7 +100,7 @@ def write_openmvg(content: Content, folder: Path) -> None:
         "sfm_data_version": "0.3",
         "root_path": "images",
         "views": views,
-        "intrinsics": [{"key": 0, "value": {**cereal, "ptr_wrapper": intrinsic}}],
+        "intrinsics": intrinsics,
         "extrinsics": extrinsics,
         "structure": structure,
         "control_points": [],
@@ -148,17 +152,22 @@ WRITERS: dict[str, Callable[[Content, Path], None]] = {
 
 
 def _mvg_views(content: Content) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    views, extrinsics = [], []
+    views, extrinsics, sizes = [], [], _sizes(content)
     for i, frame in enumerate(content.frames):
         width, height = _size(frame)
         data = {"local_path": "", "filename": frame.name, "width": width, "height": height}
-        data |= {"id_view": i, "id_intrinsic": 0, "id_pose": i}
+        data |= {"id_view": i, "id_intrinsic": sizes.index((width, height)), "id_pose": i}
         wrapper = {"id": 2147483650 + i, "data": data}
         views.append({"key": i, "value": {"polymorphic_id": 1073741824, "ptr_wrapper": wrapper}})
         rotation, translation = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]
         center = -rotation.T @ translation
         extrinsics.append({"key": i, "value": {"rotation": rotation.tolist(), "center": center.tolist()}})
     return views, extrinsics
+
+
+def _sizes(content: Content) -> list[tuple[int, int]]:
+    """Return the sizes of the images, each once."""
+    return [*dict.fromkeys(map(_size, content.frames))]
 
 
 def _size(frame: Frame) -> tuple[int, int]:

@@ -6,7 +6,6 @@ prepare.json, at the destination, records options and result, by which a finishe
 import errno
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from padgs.clock import cores
 from padgs.data.assemble import PREPARED
 from padgs.data.capture import DataError
 from padgs.data.masks import mask_path
@@ -34,7 +34,7 @@ def threads_for(width: int, height: int) -> int:
     each = MEMORY_PER_THREAD * max(1.0, min(width * height, MAX_PIXELS) / (2048 * 1024))
     free = free_memory()
     affordable = MAX_THREADS if free is None else int(free / each)
-    return max(1, min(MAX_THREADS, os.cpu_count() or 1, affordable))
+    return max(1, min(MAX_THREADS, cores(), affordable))
 
 
 def free_memory() -> int | None:
@@ -120,7 +120,7 @@ def fingerprint(source: Path, options: PrepareOptions) -> str:
     """Return a digest of images with masks, or of a video and its mask files, since its frames are deleted."""
     if not is_video(source):
         return find_source(source, options.mask).fingerprint
-    digests, mask = [_file_digest(source)], mask_path(options.mask, Path())
+    digests, mask = [_file_digest(source)], mask_path(options.mask.removeprefix("inverted:"), Path())
     if mask is not None:
         files = sorted(file for file in (mask, *mask.rglob("*")) if file.is_file())
         digests += [f"{file.relative_to(mask)}:{_file_digest(file)}" for file in files]

@@ -5,13 +5,13 @@ the vertical shifts the image exactly.
 """
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 
+from padgs.clock import cores
 from padgs.data.capture import DataError
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
@@ -81,7 +81,7 @@ def center(cam_from_world: Array) -> Array:
 
 def workers() -> int:
     """Return the number of rendering threads: one per available processor, at most 8."""
-    return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    return min(8, cores())
 
 
 def _jitter(height: int, samples: int, seed: int) -> Array:

@@ -157,6 +157,9 @@ def test_forged_values_are_ignored(run):
             until(lambda: "numbers below" in page._summary.content)
             send(CAMERA)
             until(lambda: " ms" in page._summary.content)
+        page._renderers[0].nearest = lambda _: {}["<img src=x>"]
+        update(page._layer, "error", "<b>KeyError</b>: '&lt;img src=x&gt;'")
+        update(page._layer, "colours", " ms")
         for width in (10**9, -5, 2**62):
             send(CAMERA | {"image_width": width})
             until(lambda: " ms" in page._summary.content)

@@ -1,6 +1,7 @@
 """Conversion of every format to every other, and of nothing partially."""
 
 import errno
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -14,6 +15,7 @@ from support.fixtures import WRITERS, World, write_cloud
 
 from padgs.cli.convert import FORMATS
 from padgs.data import DataError, DataOptions, load, read
+from padgs.data.capture import Frame
 from padgs.data.formats import writers
 from padgs.data.formats.convert import convert
 from padgs.scene import Scene
@@ -33,6 +35,18 @@ def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
     scene, truth = load(tmp_path / "out put"), load(tmp_path / "in")
     assert scene.notes[0].startswith(f"format: {to}")
     _same(scene, truth, world)
+
+
+def test_openmvg_has_an_intrinsic_for_each_size(world: World, tmp_path: Path) -> None:
+    sizes = [(64, 32), (64, 32), (128, 64)]
+    frames = tuple(Frame(f"{k}.png", tmp_path, torch.eye(4).double(), *size) for k, size in enumerate(sizes))
+    writers.write_openmvg(writers.Content(frames, None, None, {}), tmp_path)
+    data = json.loads((tmp_path / "sfm_data.json").read_text())
+    by_key = {one["key"]: one["value"]["ptr_wrapper"]["data"]["value0"] for one in data["intrinsics"]}
+    views = [view["value"]["ptr_wrapper"]["data"] for view in data["views"]]
+    assert [(by_key[view["id_intrinsic"]]["width"], by_key[view["id_intrinsic"]]["height"]) for view in views] == sizes
+    wrappers = [one["value"]["ptr_wrapper"]["id"] for name in ("views", "intrinsics") for one in data[name]]
+    assert len({*wrappers}) == 5 and [*by_key] == [0, 1]
 
 
 @pytest.mark.parametrize("points", ["mine.ply", "random"])

@@ -164,6 +164,15 @@ def test_e57_files_hold_panoramas_poses_and_points(e57: Path, world: World) -> N
         assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
 
 
+def test_pictures_of_another_export_of_an_e57_file_are_written_again(e57: Path, world: World) -> None:
+    read(e57)
+    (written,) = [path for path in e57.parent.rglob("*.png") if "pano_00_" in path.name]
+    content = written.read_bytes()
+    written.write_bytes(bytes(len(content)))  # as long
+    read(e57)
+    assert written.read_bytes() == content
+
+
 def test_e57_files_without_panoramas_or_poses_are_refused(e57: Path, world: World) -> None:
     write_e57(world, e57.with_name("b.e57"), pose="place")
     with pytest.raises(

@@ -12,6 +12,7 @@ from PIL import Image
 from padgs.data import DataError
 from padgs.data.assemble import PREPARED, SKIPPED
 from padgs.data.prepare.sources import _pixels, extract_frames, find_source, is_video, sharpness
+from padgs.data.prepare.work import PrepareOptions, fingerprint
 from padgs.results import CONFIG_NAME, PICTURES
 
 
@@ -124,6 +125,16 @@ def write(path, frames, times=None):
             frame.pts = index if times is None else times[index]
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("prefix", ["", "inverted:"])
+def test_changed_masks_of_a_video_are_noticed(tmp_path, prefix):
+    (tmp_path / "a.mp4").write_bytes(b"a video")
+    save(tmp_path / "masks" / "a.png", 255)
+    options = PrepareOptions(mask=f"{prefix}{tmp_path / 'masks'}")
+    before = fingerprint(tmp_path / "a.mp4", options)
+    save(tmp_path / "masks" / "a.png", 0)
+    assert fingerprint(tmp_path / "a.mp4", options) != before == before
 
 
 def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
