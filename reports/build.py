@@ -86,17 +86,17 @@ class _Builder:
             every = published.scenes(published.load(), published.DATASETS[dataset])
             if done := [of for of in there if of.dataset == dataset and not of.apart]:
                 done.sort(key=lambda place: every.index(place.scene) if place.scene in every else len(every))
-                blocks += self._average(published.TITLES[dataset], done, len(every))
+                blocks += self._average(published.TITLES[dataset], done, len(every), self.runs)
                 if missing := [scene for scene in every if scene not in {place.scene for place in done}]:
                     notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(missing)}.")
                 if self.spec.scenes_down:
                     blocks += self._scenes_down(dataset, done)
-        if self.spec.averages:
-            others = [place for place in there if not place.apart and place.dataset not in self.spec.paper]
+        for values, runs in self._alike() if self.spec.averages else ():
+            others = [place for place in by_place(runs) if not place.apart and place.dataset not in self.spec.paper]
             for kind in dict.fromkeys(place.seen for place in others):
                 alike = [place for place in others if place.seen == kind]
                 try:
-                    blocks += self._average("", alike, len(alike))
+                    blocks += self._average("", alike, len(alike), runs, values)
                 except Mixture as mixture:  # each scene has a block of its own all the same
                     notes.append(f"No mean over the scenes{f' {kind}' if kind else ''}: {mixture.what}.")
         notes += footnotes(self.shown, *self.protocols)
@@ -123,6 +123,10 @@ class _Builder:
         if spec.outdoor is not None:
             runs = runs.loc[[place.outdoor is spec.outdoor for place in runs["place"]]]
         return PREPARE[spec.prepare](runs)
+
+    def _alike(self) -> list[tuple[tuple[str, ...], DataFrame]]:
+        """Return values of the columns of `Spec.blocks`, and the runs of all scenes that share them."""
+        return grouped(self.runs, *self.spec.blocks) if self.spec.blocks else [((), self.runs)]
 
     def _groups(self) -> Iterator[tuple[str, Place, DataFrame]]:
         """Yield title, scene and runs of each block."""
@@ -208,16 +212,22 @@ class _Builder:
             rows.append(Row(titles[value], tuple(row)))
         return tuple(rows)
 
-    def _average(self, title: str, places: Sequence[Place], count: int) -> list[Block]:
-        """Return a block with the mean over scenes, beside the paper's over the same; none for a single scene."""
+    def _average(
+        self, title: str, places: Sequence[Place], count: int, runs: DataFrame, values: Sequence[str] = ()
+    ) -> list[Block]:
+        """Return a block with the mean over scenes, beside the paper's over the same; none for a single scene.
+
+        `values` are those of `Spec.blocks` that all runs share.
+        """
         if len(places) < 2:
             return []
-        runs = self.runs.loc[self.runs["place"].isin(places)]
+        runs = runs.loc[runs["place"].isin(places)]
         words = f"{len(places)} of its {count} scenes" if len(places) < count else f"its {count} scenes"
         kind = f" {places[0].seen}" if places[0].seen else ""
         heading = f"{title}, average over {words}" if title else f"Average over {count} scenes{kind}"
         if not title or len(places) < count:
             heading += f": {', '.join(place.label for place in places)}"
+        heading = ", ".join([heading, *values])
         refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.shared if of != "data"])
         self.unranked.append(unranked(runs))
         titles, cells, theirs = self._titles(Place(places[0].dataset, AVERAGE), runs), {}, {}

@@ -37,7 +37,6 @@ COSTS = {
         Measure("train_hours", Column("training h", 4, False, group="training h"), "train_hours"),
         Measure("train_seconds", Column("training s", 0, False)),
         Measure("cpu_seconds", Column("CPU s", 0, False)),
-        Measure("wall_seconds", Column("wall s", 0, False)),
         Measure("fps", Column("FPS", 2, True, group="FPS"), "fps"),
         Measure("frame_ms", Column("ms per frame", 1, False)),
         Measure("anchors", Column("anchors", 0)),

@@ -40,7 +40,7 @@ class Spec:
     equal_images: bool | None = None  # leave out of the ranking: see `conditions.unranked`; None: nothing
     # Columns of the paper, and notes
     paper: Mapping[str, int] = field(default_factory=dict)  # data set -> table of the paper
-    averages: bool = False  # a block with the mean over each data set of `paper`, and over all other scenes
+    averages: bool = False  # blocks with the means over each data set of `paper`, and over all other scenes
     scenes_down: bool = False  # the data sets of `paper` have a block for each measure, with methods across
     pivot: Sequence[str] = ()  # columns of the frame whose values are columns of the first measure
     protocols: Sequence[str] = ()  # of the footnotes; empty: that of the request

@@ -176,6 +176,7 @@ def set_axis(axis: Any, values: Sequence[float], logarithmic: bool = False, wors
     if high == low:
         low, high = low - SINGLE[logarithmic] / 2, high + SINGLE[logarithmic] / 2
     pad = PAD * (high - low)
+    low, high = (end([v for v in (low, high, *scaled) if low - pad <= v <= high + pad]) for end in (min, max))
     ends = (10 ** (low - pad), 10 ** (high + pad)) if logarithmic else (low - pad, high + pad)
     panel, name = axis.axes, axis.axis_name
     getattr(panel, f"set_{name}scale")("log" if logarithmic else "linear")

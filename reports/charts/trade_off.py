@@ -104,23 +104,24 @@ def trade_offs(run_set: RunSet) -> list[TradeOff]:
 def equal_times(run_set: RunSet) -> list[TradeOff]:
     """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods.
 
-    The mean over the scenes of a resolution and time comes first, where there are several.
+    Means over the scenes of a resolution and time come first, of those never seen, those tuned on, and all others.
     """
     runs, found = run_set.of_experiments("equal_time"), []
     shown = replace(run_set.request, protocol=_protocol(runs))
-    groups: dict[tuple[str, str], dict[Place, DataFrame]] = {}
+    groups: dict[tuple[str, str, str], dict[Place, DataFrame]] = {}
     for name, title, own in sheets(runs.loc[runs["variant"] == ""], shown, "equal_time", OF_A_CHART):
         first = own.iloc[0]
         made = _trade_off("equal_time", {first["place"]: own}, shown)
         if len({point.preset for point in made.points}) >= FEWEST:
             found.append(replace(made, name=name, title=title))
-            groups.setdefault((first["resolution"], first["length"]), {})[first["place"]] = own
+            groups.setdefault((first["place"].seen, first["resolution"], first["length"]), {})[first["place"]] = own
     means = []
-    for (size, length), group in groups.items():
+    for (seen, size, length), group in groups.items():
         made = _trade_off("equal_time", group, shown)
         if len(group) > 1 and made.points:
-            title = f"{made.title}, {size}, {length}"
-            means.append(replace(made, name=file_name(f"equal_time_mean_{size}_{length}"), title=title))
+            title = f"{made.title}{f' ({seen})' if seen else ''}, {size}, {length}"
+            name = "_".join(filter(None, ("equal_time_mean", seen, size, length)))
+            means.append(replace(made, name=file_name(name), title=title))
     return [*means, *found]
 
 

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import pytest
-from support.made_up import builder, columns, compared, external, failed, result, run_set, small, value
+from support.made_up import at_equal_time, builder, columns, compared, external, failed, result, run_set, small, value
 
 from padgs.reports.writers import markdown
 
-table1, methods, runs = map(builder, ("table1", "methods", "runs"))
+table1, methods, runs, equal_time = map(builder, ("table1", "methods", "runs", "equal_time"))
 ROOM = "synthetic-room"
 
 
@@ -70,3 +70,20 @@ def test_scenes_tuned_on_and_never_seen_stand_apart():
     ]
     assert "nobody had trained on it" in "".join(table.notes)
     assert "tuned" not in markdown(methods(run_set(made[-1:])))
+
+
+def test_means_over_scenes_are_of_one_size_and_length():
+    scenes = "synthetic-outdoor, synthetic-room"
+    made = at_equal_time("synthetic-room", "synthetic-outdoor")
+    shorter = [
+        replace(run, run=f"{run.run}-short", config={**run.config, "budget": {"seconds": 20.0, "clock": "cpu"}})
+        for run in made
+    ]
+    table = equal_time(run_set([*made, *shorter]))
+    assert [block.title for block in table.blocks[:2]] == [
+        f"Average over 2 scenes: {scenes}, 512x256, {seconds} s of CPU time" for seconds in (60, 20)
+    ]
+    assert value(table, table.blocks[0].title, "OmniGS, corrected", "WS-PSNR") == pytest.approx((26 + 30) / 2 - 0.4)
+    assert [block.title for block in equal_time(run_set(made[:3])).blocks] == [
+        "synthetic-room (generated), 512x256, 60 s of CPU time"
+    ]

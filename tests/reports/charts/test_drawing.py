@@ -67,6 +67,13 @@ def test_an_axis_contains_its_values_and_has_ticks(known, logarithmic):
     assert sum(low <= tick <= high for tick in axes[0, 0].get_yticks()) >= 2
 
 
+def test_no_value_lies_on_the_edge_of_an_axis():
+    made, axes = figure(1, 1)
+    known = [18.9, 22.4, 27.1, 31.3, 33.2, 40.8, 46.8, 97.0, 111.4]
+    low, high = set_axis(axes[0, 0].xaxis, known, logarithmic=True, worse=1)
+    assert not any(value < high < 1.03 * value or low < value < 1.03 * low for value in known)
+
+
 @pytest.fixture
 def panel():
     made, axes = figure(1, 1, 5.0, 4.0)
