@@ -11,7 +11,6 @@ from pandas import DataFrame
 from padgs.reports import REPORTS, methods, published
 from padgs.reports.conditions import Reason, as_published, footnotes, refuse_mixture, unranked, unranked_notes
 from padgs.reports.frame import (
-    CONFIG,
     LARGEST_FACTOR,
     LINEAR,
     LINEAR_ITERATIONS,
@@ -20,6 +19,7 @@ from padgs.reports.frame import (
     by_place,
     grouped,
     law,
+    without_data,
 )
 from padgs.reports.measures import Measure, quantity
 from padgs.reports.published import AVERAGE, Place, Published
@@ -229,9 +229,9 @@ class _Builder:
             heading += f": {', '.join(place.label for place in places)}"
         heading = ", ".join([heading, *values])
         refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.shared if of != "data"])
-        self.unranked.append(unranked(runs))
+        self.unranked.append(unranked(runs, equal_images=self.spec.equal_images is not False))
         titles, cells, theirs = self._titles(Place(places[0].dataset, AVERAGE), runs), {}, {}
-        settings = runs.drop(columns=[column for column in runs if column.startswith(f"{CONFIG}data.")])
+        settings = without_data(runs)
         for preset, words in titles.items():
             alike = settings.loc[settings["preset"] == preset]
             refuse_differences(alike, f"{title or heading}, {words}", "preset")

@@ -154,6 +154,19 @@ def decides(key: str) -> bool:
     return not any(key == other or key.startswith(f"{other}.") for other in WITHOUT_EFFECT)
 
 
+def setting(config: Mapping[str, Any]) -> str:
+    """Return what of dotted keys and values decides the setting of a run."""
+    return json.dumps({key: value for key, value in config.items() if decides(key)}, sort_keys=True)
+
+
+def without_data(runs: DataFrame) -> DataFrame:
+    """Return runs whose settings are compared without those of their data, for means over scenes."""
+    kept = [json.loads(text).items() for text in runs["setting"]]
+    of_methods = [setting({key: value for key, value in own if not key.startswith("data.")}) for own in kept]
+    columns = [column for column in runs if column.startswith(f"{CONFIG}data.")]
+    return runs.drop(columns=columns).assign(setting=of_methods)
+
+
 def _hardware(result: Result) -> str:
     known = result.machine
     where = known.get("gpu") or f"{known.get('cores')} cores of {known.get('cpu')}"
@@ -268,9 +281,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "learning_rates": _learning_rates,
     "hardware": _hardware,
     "machine": _machine,
-    "setting": lambda result: json.dumps(
-        {key: value for key, value in flat(result.config) if decides(key)}, sort_keys=True
-    ),
+    "setting": lambda result: setting(dict(flat(result.config))),
     "smallest": lambda result: _searched(result.smallest),
     "view_psnr": lambda result: _view_psnr(result.scores),
 }

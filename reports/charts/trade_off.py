@@ -9,7 +9,7 @@ from pandas import DataFrame
 
 from padgs.reports import methods, published
 from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets
-from padgs.reports.frame import by_place
+from padgs.reports.frame import by_place, without_data
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, settings
@@ -49,6 +49,7 @@ class TradeOff:
     points: tuple[Point, ...]
     runs: DataFrame
     notes: tuple[str, ...]
+    equal_images: bool = True  # whether methods are compared after as many images; else after equal time
 
     def role(self, preset: str) -> str:
         """Return "release" for a released program with its deviations, "main" for the preset that stands for its method
@@ -111,14 +112,18 @@ def equal_times(run_set: RunSet) -> list[TradeOff]:
     groups: dict[tuple[str, str, str], dict[Place, DataFrame]] = {}
     for name, title, own in sheets(runs.loc[runs["variant"] == ""], shown, "equal_time", OF_A_CHART):
         first = own.iloc[0]
-        made = _trade_off("equal_time", {first["place"]: own}, shown)
+        made = _trade_off("equal_time", {first["place"]: own}, shown, equal_images=False)
         if len({point.preset for point in made.points}) >= FEWEST:
             found.append(replace(made, name=name, title=title))
-            groups.setdefault((first["place"].seen, first["resolution"], first["length"]), {})[first["place"]] = own
+            groups.setdefault((first["place"].seen, first["resolution"], first["length"]), {})[first["place"]] = (
+                without_data(own)
+            )
     means = []
     for (seen, size, length), group in groups.items():
-        made = _trade_off("equal_time", group, shown)
-        if len(group) > 1 and made.points:
+        made = _trade_off("equal_time", group, shown, equal_images=False)
+        if len(group) > 1 and not made.points:
+            run_set.warnings.append(f"{size}, {length}: no scene was finished in all settings, so there is no mean")
+        elif len(group) > 1:
             title = f"{made.title}{f' ({seen})' if seen else ''}, {size}, {length}"
             name = "_".join(filter(None, ("equal_time_mean", seen, size, length)))
             means.append(replace(made, name=file_name(name), title=title))
@@ -142,7 +147,7 @@ def _is_release(preset: str) -> bool:
     return methods.published_as(preset) != preset
 
 
-def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
+def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, equal_images: bool = True) -> TradeOff:
     measures = (*(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/")), *COSTS)
     found = settings(pd.concat(group.values()))
     for setting in found:
@@ -164,7 +169,7 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) ->
         what = f"{what}, mean over its scenes {named}" if what else f"mean over {named}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol)
-    return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes))
+    return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes), equal_images)
 
 
 def _protocol(runs: DataFrame) -> str:

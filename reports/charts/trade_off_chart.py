@@ -96,7 +96,10 @@ def draw(
     shown = shown or (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
     made, axes = figure(len(shown), 1, *SIZE)
     marks = [_marks(trade_off, cost) for cost, _, _ in shown]
-    presets, apart = [point.preset for point in trade_off.points], unranked(trade_off.runs)
+    presets, apart = (
+        [point.preset for point in trade_off.points],
+        unranked(trade_off.runs, equal_images=trade_off.equal_images),
+    )
     for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
         panel.set_xlabel(f"{words}, {unit} ↓")
         panel.set_ylabel(f"{quality.column.title}, dB ↑")

@@ -84,6 +84,7 @@ def test_means_over_scenes_are_of_one_size_and_length():
         f"Average over 2 scenes: {scenes}, 512x256, {seconds} s of CPU time" for seconds in (60, 20)
     ]
     assert value(table, table.blocks[0].title, "OmniGS, corrected", "WS-PSNR") == pytest.approx((26 + 30) / 2 - 0.4)
+    assert "Not ranked" not in "".join(table.notes)
     assert [block.title for block in equal_time(run_set(made[:3])).blocks] == [
         "synthetic-room (generated), 512x256, 60 s of CPU time"
     ]

@@ -144,8 +144,11 @@ def at_equal_time(*scenes: str) -> list[Result]:
     made = []
     for index, scene in enumerate(scenes):
         for n, preset in enumerate(("odgs", "omnigs", "spags")):
-            one = of_experiment("equal_time", 25.0 + n + 4 * index, preset=preset, scene=scene)
-            made.append(replace(one, config={**one.config, "budget": {"seconds": 60.0, "clock": "cpu"}}))
+            one = of_experiment("equal_time", 25.0 + n + 4 * index, preset=preset, scene=scene, cost=1.0 + n)
+            data = {"generator": {"scene": scene}} if index % 2 else {"path": scene}
+            config = {**one.config, "data": data, "budget": {"seconds": 60.0, "clock": "cpu"}}
+            done = 1500 if n else 500  # slow methods have fewer iterations, and are ranked
+            made.append(replace(one, config=config, iterations=done, iterations_done=done))
     return made
 
 

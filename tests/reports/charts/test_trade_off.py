@@ -101,6 +101,12 @@ def test_the_mean_over_scenes_after_equal_time_comes_first():
     assert mean.title == "mean over synthetic-outdoor, synthetic-room, 512x256, 60 s of CPU time"
     assert numbers(mean)["OmniGS, corrected", "WS-PSNR"] == pytest.approx((26 + 30) / 2 - 0.4)
     assert [made.name for made in equal_times(run_set(runs[:5]))] == [scenes[1].name], "two methods are no chart"
+    (panel, marks, _, _), *_ = draw(mean)[1]
+    slow = min(marks, key=lambda mark: mark.y)
+    assert slow.point.preset == "odgs" and slow.x == panel.lines[0].get_xydata()[0, 0], "it begins the front"
+    other = replace(runs[0], config={**runs[0].config, "method": {"tau": 0.5}})
+    differing = run_set([other, *runs[1:]])
+    assert len(equal_times(differing)) == 2 and "so there is no mean" in "".join(differing.warnings)
 
 
 def test_quality_over_training_time_comes_from_the_logs(tmp_path, monkeypatch):
