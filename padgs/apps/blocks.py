@@ -26,6 +26,7 @@ from torch import Tensor
 import padgs.data
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions
+from padgs.data.depths import write_depths
 from padgs.data.formats.writers import Content, write_transforms
 from padgs.data.masks import write_masks
 from padgs.files import draft_of
@@ -202,7 +203,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             for view in views:
                 link, image = Path("images", frames[view.name].name), frames[view.name].image.resolve()
                 (folder / link).parent.mkdir(parents=True, exist_ok=True)
-                (folder / link).symlink_to(os.path.relpath(image, (final / link).parent.absolute()))
+                (folder / link).symlink_to(os.path.relpath(image, (final / link).parent.resolve()))
             kept = torch.from_numpy(blocks.used[number][nearest])
             shares = {name: round(sphere_share(part), 4) for name, part in held.items()}
             sizes = {view.name: {"width": view.width, "height": view.height} for view in views}
@@ -214,6 +215,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             )
             write_transforms(content, folder)
             within = {view.name: partial_mask(view, held[view.name]) for view in (*core, *margin) if view.name in held}
+            write_depths(views, folder)
             write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
             if (folder / "masks").is_dir():  # they hide most of a view, and are meant to
                 described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))

@@ -11,7 +11,9 @@ def export(
     run: Run,
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
-    smooth: Annotated[bool, typer.Option("--smooth", help="at least a pixel wide, as .html always is")] = False,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html always does")
+    ] = False,
     distillation_steps: Annotated[
         int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
     ] = None,
@@ -24,8 +26,9 @@ def export(
 
     The Gaussians of PaD-GS differ from view to view, so they are baked into explicit ones; the loss is measured,
     printed and written into the file. Viewers that come nearer than the cameras, or have smaller pixels, show thin
-    Gaussians as needles; --smooth writes none thinner than a pixel of the nearest photograph. Formats other than .ply
-    are made by splat-transform (npm install -g @playcanvas/splat-transform); .sog and .html can take minutes.
+    Gaussians as needles; --smooth writes none of padgs+ thinner than a pixel of the nearest photograph, and changes
+    no method without a 3D filter. Formats other than .ply are made by splat-transform
+    (npm install -g @playcanvas/splat-transform); .sog and .html can take minutes.
     """
     from pathlib import Path
 

@@ -107,13 +107,15 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
 
 
 def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]:
-    """Return the folder for decoded images beyond the memory, none if it would take half of the free space; a note."""
+    """Return the folder for decoded images beyond the memory, and a note; no folder if they would take half of the free
+    space and of what the cache holds, which may be these images.
+    """
     if size <= options.cache_bytes or options.disk_cache == "off":
         return None, []
     folder = Path(options.disk_cache) if options.disk_cache != "auto" else cache_root() / "images"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(folder).free
+        free = shutil.disk_usage(folder).free + sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
     except OSError as error:
         why = f"cannot write {folder}: {error.strerror}"
         raise DataError(f"data.disk_cache: {why}; name another folder, or off") from error

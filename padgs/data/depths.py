@@ -10,7 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath
+from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -76,9 +77,9 @@ def with_depths(
     Maps are held in memory if all fit into `cache_bytes`; else they are read on each access. A DataError says that a
     file is of unknown meaning, damaged, of another shape than its view, or without a known distance.
     """
-    files, meaning = ({}, None) if options.depth == "none" else _depth_files(capture)
+    files, meaning, notes = ({}, None, []) if options.depth == "none" else _depth_files(capture)
     if meaning is None:
-        return list(views), [], []
+        return list(views), [], notes
     made, digests, sizes, total = [], [f"{meaning.measure}{meaning.unit}"], set(), 0
     for view, frame in zip(views, capture.frames, strict=True):
         if (file := files.get(frame.name)) is None:
@@ -151,8 +152,8 @@ def _exr(file: Path) -> NDArray:
     return first
 
 
-def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None]:
-    """Return the depth files by frame, as the format names them or from a `depths/` folder, and what they hold."""
+def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None, list[str]]:
+    """Return depth files by frame, what they hold, and notes; they are the format's, or lie in a `depths/` folder."""
     if capture.depth is not None:
         named = {frame.name: frame.depth for frame in capture.frames if frame.depth is not None}
         if absent := [path for path in named.values() if not path.is_file()]:
@@ -160,23 +161,35 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
                 f"{len(absent)} depth maps of {capture.format} do not exist ({listed(absent)}); copy them, or set "
                 "data.depth=none"
             )
-        return named, capture.depth if named else None
-    places = (capture.folder, capture.image_folder.parent)
+        return named, capture.depth if named else None, []
+    places, notes = (capture.folder, capture.image_folder.parent), []
     for folder in dict.fromkeys(base / name for base in places for name in FOLDERS):
         there = {
-            path.relative_to(folder).with_suffix("").as_posix(): path
+            _folded(path.relative_to(folder).with_suffix("")): path
             for path in sorted(folder.rglob("*"))
             if path.suffix.lower() in EXTENSIONS and path.is_file()
         }
-        stems = {frame.name: frame.name.rpartition(".")[0] for frame in capture.frames}
-        files = {
-            name: there[key]
-            for name, stem in stems.items()
-            if (key := next((key for key in (stem, f"{stem}_depth") if key in there), None)) is not None
-        }
+        files = {}
+        for frame in capture.frames:
+            image = PurePosixPath(frame.name)
+            names = (image.stem, image.name, f"{image.stem}_depth", f"depth_{image.stem}")
+            keys = (_folded(image.with_name(name)) for name in names)
+            if found := next((there[key] for key in keys if key in there), None):
+                files[frame.name] = found
         if files:
-            return files, _stated(folder / STATEMENT, any(path.suffix.lower() == ".png" for path in files.values()))
-    return {}, None
+            is_png = any(path.suffix.lower() == ".png" for path in files.values())
+            return files, _stated(folder / STATEMENT, is_png), notes
+        if there:
+            examples = f"{next(iter(there.values())).name} for {capture.frames[0].name}"
+            notes.append(
+                f"depth: none of the {len(there)} maps in {folder} has the name of an image, such as {examples}"
+            )
+    return {}, None, notes
+
+
+def _folded(name: PurePath) -> str:
+    """Return a name as it is compared: without case, in one Unicode form."""
+    return normalize("NFC", name.as_posix()).casefold()
 
 
 def _stated(file: Path, is_png: bool) -> DepthMeaning:

@@ -115,6 +115,22 @@ def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
     assert sorted(tests) == sorted(view.name for view in whole.test)
 
 
+def test_blocks_below_a_linked_folder_have_their_images_and_depth_maps(source, tmp_path):
+    real = tmp_path / "disk" / "deep"
+    shutil.copytree(source, real / "rooms")
+    (tmp_path / "data").symlink_to(real)
+    (real / "rooms" / "depths").mkdir()
+    for image in (real / "rooms" / "images").iterdir():
+        np.save(real / "rooms" / "depths" / f"{image.stem}.npy", np.ones((16, 32), np.float32))
+    (real / "rooms" / "depths" / "depth.json").write_text('{"measure": "ray"}')
+    done = CliRunner().invoke(app, ["split", str(tmp_path / "data" / "rooms"), "--blocks", "2"])
+    assert done.exit_code == 0, done.output
+    links = [*(real / "rooms-blocks").glob("*/images/*")]
+    assert links and all(link.is_symlink() and link.is_file() for link in links)
+    for part in (real / "rooms-blocks").glob("rooms-block-*"):
+        assert all(view.load_depth is not None for view in padgs.data.load(part).train)
+
+
 def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, capsys):
     path = merge(runs, Console(width=200))
     assert f"padgs-run data.path={source} init={path} train.refine=true" in capsys.readouterr().out

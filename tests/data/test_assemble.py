@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 from support.fixtures import World, write_colmap_text, write_transforms
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
+from padgs.data.assemble import disk_cache
 
 
 @pytest.fixture
@@ -214,3 +216,14 @@ def test_two_files_for_one_name_are_not_chosen_from(transforms: Path) -> None:
     _name(transforms, "images/pano_00", "images/other")
     with pytest.raises(DataError, match="1 of 6 poses have no image in .*: other.png"):
         load(transforms)
+
+
+def test_images_that_the_disk_cache_holds_do_not_count_against_it(tmp_path, monkeypatch):
+    free = 1000
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    options = DataOptions(cache_bytes=0, disk_cache=str(tmp_path / "cache"))
+    assert disk_cache(options, 501)[0] is None and "half of the free space" in disk_cache(options, 501)[1][0]
+    assert disk_cache(options, 400)[0] == tmp_path / "cache"
+    (tmp_path / "cache" / "a").write_bytes(bytes(400))
+    free = 600
+    assert disk_cache(options, 400)[0] == tmp_path / "cache"

@@ -14,9 +14,9 @@ from support.fixtures import HALF, World, write_cloud, write_colmap_text
 
 from padgs.checks import lookup
 from padgs.data import DATASETS, DataError, load
-from padgs.data.capture import DepthMeaning
+from padgs.data.capture import Capture, DepthMeaning, Frame
 from padgs.data.check import check
-from padgs.data.depths import Depth
+from padgs.data.depths import Depth, _depth_files
 from padgs.data.formats.convert import convert
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import score
@@ -116,6 +116,28 @@ def test_tartanair(world: World, tmp_path: Path):
     (folder / "poses.txt").write_text("10 0 0 0 0 0 1\n")
     with pytest.raises(DataError, match="line 1 of .*poses.txt has 6 numbers after the frame; it must have 7"):
         load(folder)
+
+
+@pytest.mark.parametrize(
+    ("image", "depth"),
+    [
+        ("a.png", "a.png"),
+        ("a.png", "depth_a"),
+        ("a.png", "A"),
+        ("caf\u00e9.png", "cafe\u0301"),
+        ("up/a.png", "up/a_depth"),
+    ],
+)
+def test_habits_of_names_of_depth_maps(image: str, depth: str, world: World, tmp_path: Path):
+    path, file = tmp_path / "images" / image, tmp_path / "depths" / f"{depth}.npy"
+    file.parent.mkdir(parents=True)
+    np.save(file, truth(world, 0).numpy())
+    (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray"}')
+    capture = Capture("made", tmp_path, tmp_path / "images", (Frame(image, path, torch.eye(4).double(), 64, 32),), None)
+    assert _depth_files(capture)[0] == {image: file}
+    other = replace(capture, frames=(replace(capture.frames[0], name="b.png"),))
+    files, meaning, (note,) = _depth_files(other)
+    assert (files, meaning) == ({}, None) and f"none of the 1 maps in {tmp_path / 'depths'} has the name of an" in note
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.001])

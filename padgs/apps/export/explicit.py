@@ -24,6 +24,7 @@ from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
 DISTILLATION_STEPS = 300
+UNSMOOTHED = "--smooth changes nothing: the method has no 3D filter, or it is in the scales already"
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"
 
 
@@ -67,9 +68,13 @@ def export_run(
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
             notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
+        elif smooth:
+            notes.append(UNSMOOTHED)
     elif isinstance(model, AnchorModel):
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
+        if smooth:
+            notes.append(UNSMOOTHED)
     else:
         raise ValueError(f"{run.config.method} has no Gaussians to export; use padgs render or padgs view")
     if crop is not None:

@@ -34,7 +34,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     folder = path if path.is_dir() else file.parent.parent if file.parent.name == "pano" else file.parent
     images = image_folder(folder, options.images) if options.images else image_folder(file.parent, None)
     frames = []
-    for (number, _), row in zip(lines[1:], csv.reader((line for _, line in lines[1:]), delimiter=mark), strict=True):
+    for number, line in lines[1:]:
+        row = next(csv.reader([line], delimiter=mark))
         where = f"{file}, line {number}"
         try:
             fields = dict(zip(names, map(str.strip, row), strict=True))

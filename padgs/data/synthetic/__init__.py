@@ -31,8 +31,24 @@ from padgs.scene import Scene, View
 __all__ = ["SCENES", "SyntheticOptions", "SyntheticTruth", "generate", "load"]
 
 
+OF_CAPTURES = {  # key of `data` -> what does the same in a generated scene
+    "images": "",
+    "points": ", and set data.generator.points",
+    "mask": "",
+    "depth": "",
+    "split": ", and set data.generator.train_views and test_views",
+    "test_every": ", and set data.generator.test_views",
+}
+
+
 def load(path: str | Path, options: DataOptions) -> Scene:
-    """Load the synthetic scene `path`, or the one in `options.generator` if it is empty; the entry of LOADERS."""
+    """Load the synthetic scene `path`, or the one in `options.generator` if it is empty; the entry of LOADERS.
+
+    A DataError names settings of captures, which would change nothing.
+    """
+    for name, instead in OF_CAPTURES.items():
+        if (value := getattr(options, name)) != getattr(DataOptions(), name):
+            raise DataError(f"data.{name}={value} changes nothing in a generated scene; leave it out{instead}")
     settings = dict(options.generator)
     if str(path) not in ("", "."):
         settings["scene"] = str(path)

@@ -13,7 +13,7 @@ from support.tiny_scene import tiny_scene
 from typer.testing import CliRunner
 
 import padgs
-from padgs.apps.export.explicit import UP, export_run, harmonics_rotation, transform_splats
+from padgs.apps.export.explicit import UNSMOOTHED, UP, export_run, harmonics_rotation, transform_splats
 from padgs.apps.export.splat_file import read_splats
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
@@ -53,6 +53,13 @@ def test_gaussians_are_exported_without_the_data_set(splat_run, tmp_path):
     result = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
     assert result.exit_code == 0 and "the data set is missing" in result.output
     assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.model.splats)
+
+
+def test_a_method_without_a_3d_filter_says_that_smoothing_changes_nothing(tmp_path_factory):
+    run = padgs.load_run(tiny_run(tmp_path_factory, "method=omnigs", "train.iterations=2"), device="cpu")
+    plain, smooth = (export_run(run, smooth=wanted) for wanted in (False, True))
+    assert torch.equal(plain.splats.log_scales, smooth.splats.log_scales)
+    assert [note for note in smooth.notes if note not in plain.notes] == [UNSMOOTHED]
 
 
 def test_smooth_includes_the_3d_smoothing_filter(splat_run, tmp_path):

@@ -52,6 +52,15 @@ def test_every_scene_generates(name):
     assert scene.notes == ()
 
 
+@pytest.mark.parametrize(
+    "given", [{"points": "random"}, {"mask": "rows:5/6"}, {"split": "all"}, {"test_every": 4}, {"depth": "none"}]
+)
+def test_settings_of_captures_are_refused(given):
+    ((name, value),) = given.items()
+    with pytest.raises(DataError, match=f"data.{name}={value} changes nothing in a generated scene; leave it out"):
+        load("", DataOptions(**given))
+
+
 def test_cache_gives_identical_scenes(tmp_path):
     options = SyntheticOptions(**TINY)
     first = generate(options)
