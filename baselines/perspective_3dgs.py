@@ -63,6 +63,13 @@ class Cubemap3DGSMethod(SplatMethod):
         self._views_per_step = self._views_per_panorama(scene, cut)
         return super().fit(cut, budget, stage=stage)
 
+    def refuse_search(self) -> None:
+        """Refuse: a panorama that is held out would be cut into views, of which most are trained on."""
+        raise ValueError(
+            "views are cut from all panoramas, so none can be held out for the search for the smallest model; take a "
+            "method that trains on panoramas"
+        )
+
     def _refuse_impossible(self) -> None:
         """Also refuse options that need panoramas as training views."""
         if self.render_config.projection == "pinhole" and not self.render_config.cubemap:

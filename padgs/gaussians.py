@@ -30,6 +30,10 @@ class Gaussians:
         """Return the first `count` Gaussians, without a copy."""
         return replace(self, **{f.name: getattr(self, f.name)[:count] for f in fields(self)})
 
+    def chosen(self, rows: Tensor) -> Gaussians:
+        """Return the Gaussians of some rows, given by index or mask."""
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
     def to(self, *args, **kwargs) -> Gaussians:
         """Return the Gaussians on another device or in another dtype (arguments of `Tensor.to`)."""
         return replace(self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})

@@ -84,7 +84,8 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
         pose[:3] = rotation.to(pose) @ pose[:3]
         load_pixels = pixels and _Pixels(panorama, rotation, lens, pixels)
         load_mask = mask and _Mask(panorama, rotation, lens, mask)
-        views.append(View(f"{panorama.name}-{number}", pose, lens.width, lens.height, load_pixels, load_mask, lens))
+        view = View(f"{panorama.name}-{number}", pose, lens.width, lens.height, load_pixels, load_mask, lens)
+        views.append(replace(view, share=panorama.share))
     return tuple(views)
 
 

@@ -4,7 +4,7 @@ Backends are the entries of `BACKENDS`; each is a `padgs.render.contract.Backend
 """
 
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -15,6 +15,7 @@ from padgs.checks import check_known, lookup
 from padgs.gaussians import Gaussians
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
+from padgs.render.ray_blocks import is_in_blocks, rasterize_blocks, seen
 from padgs.scene import View
 
 BACKENDS = {
@@ -72,8 +73,16 @@ def render(
             torch otherwise (with one warning if the library is missing).
     """
     request = make_request(gaussians, view, options, background, mean_offsets, absgrad)
-    rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, gaussians.means), "backend")
-    return rasterize_cubemap(rasterize, request) if options.cubemap else rasterize(request)
+    name = resolve_backend(backend, gaussians.means)
+    rasterize: Backend = lookup(BACKENDS, name, "backend")
+    if options.cubemap:
+        return rasterize_cubemap(rasterize, request)
+    if not is_in_blocks(view.camera):
+        return rasterize(request)
+    if name != "torch":
+        return rasterize_blocks(rasterize, request)
+    rendering = rasterize(request)
+    return replace(rendering, visible=rendering.visible & seen(request))
 
 
 def make_request(

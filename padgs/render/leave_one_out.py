@@ -21,6 +21,7 @@ from padgs.render import make_request, resolve_backend
 from padgs.render.backends.torch import blocks, fragments, sorted_weights
 from padgs.render.contract import CORE_SIZE, Removals, RenderOptions, Request
 from padgs.render.projection import project
+from padgs.render.ray_blocks import is_in_blocks, score_blocks
 from padgs.scene import View
 
 Backend = Callable[[Request, Tensor, Tensor], Removals]  # target [H, W, 3], weight [H, W] of each squared error
@@ -67,7 +68,10 @@ def leave_one_out(
     weight = weight.to(target).expand(target.shape[:2])
     weight = (weight / weight.double().sum()).to(target).contiguous()
     backend_score: Backend = lookup(BACKENDS, resolved, "backend")
-    found = backend_score(request, target.contiguous(), weight)
+    if resolved != "torch" and is_in_blocks(view.camera):
+        found = score_blocks(backend_score, request, target, weight)
+    else:
+        found = backend_score(request, target.contiguous(), weight)
     return replace(found, error=found.error / 3, change=found.change / 3)  # means over channels
 
 

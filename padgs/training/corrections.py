@@ -201,6 +201,11 @@ class Corrections(nn.Module):
                     raise ValueError(f"train.lens is {options.lens}, but view {view.name!r} is no panorama; set given")
             first, axis = scene.train[0], options.lens.removeprefix(FISHEYES)
             is_map = options.lens == MAP
+            if is_map and options.depth_weight:
+                raise ValueError(
+                    "train.lens=map resamples photographs, and not their depth maps; set train.depth_weight=0, or "
+                    "another lens"
+                )
             self.lens = CameraMap(first.width, first.height) if is_map else DualLens(axis, scene_scale=scene.scale)
 
     def groups(self, iterations: int) -> list[ParameterGroup]:

@@ -265,7 +265,8 @@ class Method(ABC):
         assert budget.seconds is not None
         random, first = torch.get_rng_state(), 0.0
         short = Budget(PUBLISHED_ITERATIONS, clock=budget.clock)
-        one = replace(scene, train=scene.train[:1])
+        wanted = [view for view in scene.train if view.load_depth] if self.train_options.depth_weight else []
+        one = replace(scene, train=tuple(wanted[:1]) or scene.train[:1])
         trainer = self.build_trainer(self._initial_model(scene, short.iterations), one, short, nullcontext)
         for record in trainer.records():
             if record.iteration == 1:  # includes work that is done only once

@@ -61,6 +61,11 @@ def through_faces(panorama: View) -> torch.Tensor:
     return panorama_from_faces(faces, Panorama(WIDTH, HEIGHT), lens).image
 
 
+def test_cut_views_are_drawn_as_often_as_their_panorama(panorama: View):
+    faces = perspective_views(replace(panorama, share=0.25), FACES, face_camera(Panorama(64, 32)))
+    assert [view.share for view in faces] == [0.25] * 6
+
+
 def test_views_show_the_panorama_at_their_pose(panorama: View):
     for view in perspective_views(panorama, FACES, square_lens(panorama.camera, 1.0)):
         world = view.camera.rays(dtype=torch.float64) @ view.cam_from_world[:3, :3]

@@ -83,6 +83,13 @@ def test_small_views_have_small_depth_maps():
     assert torch.equal(depth_of(halved(view)).nan_to_num(), depth_of(view)[::2, ::2].nan_to_num())
 
 
+def test_some_views_may_have_no_depth_map():
+    scene = with_depth()
+    first = replace(scene.train[0], load_depth=None)
+    method = PlusMethod(train=TrainOptions(depth_weight=0.1))
+    assert next(method.fit(replace(scene, train=(first, *scene.train[1:])), Budget(5, seconds=0.5))).loss > 0
+
+
 def test_missing_and_wrong_depth_maps_are_refused():
     scene, options = tiny_scene(), TrainOptions(depth_weight=0.1)
     with pytest.raises(ValueError, match="train.depth_weight is not 0, but no training view has a depth map"):

@@ -184,6 +184,12 @@ def test_only_panoramas_have_a_lens_to_learn(lens):
         Corrections(scene, TrainOptions(lens=lens))
 
 
+def test_a_learned_map_refuses_depth_maps_that_it_would_not_resample():
+    with pytest.raises(ValueError, match="train.lens=map resamples photographs, and not their depth maps"):
+        Corrections(tiny_scene(), TrainOptions(lens="map", depth_weight=0.1))
+    assert Corrections(tiny_scene(), TrainOptions(lens="fisheyes_y", depth_weight=0.1)).lens is not None
+
+
 def test_masks_are_undistorted_with_the_image():
     mask = torch.ones(16, 32)
     mask[10:] = 0

@@ -104,6 +104,11 @@ class PlusModel(SplatModel):
         state = super().state()
         return State(state.tensors | {CAMERAS: self._cameras}, state.values | {"step": self._step})
 
+    def load_model(self, state: State) -> None:
+        """Load the parameters only, as those of a finished schedule: without dropout until `adapt` says otherwise."""
+        super().load_model(state)
+        self._step = self.iterations
+
     def load_state(self, state: State) -> None:
         """Restore the model that `state` was taken of."""
         super().load_state(state)

@@ -27,7 +27,7 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.scene import Scene
 from padgs.training.health import Failure
 from padgs.training.loop import Record
-from padgs.training.options import Budget
+from padgs.training.options import Budget, TrainOptions
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, initial_per_pixel=None, limit_per_pixel=None, depth_init_per_pixel=0.0)
 
@@ -251,6 +251,15 @@ def test_dropout_scales_the_kept_opacities(done, share):
     drawings[0].rendering.image.sum().backward()
     gradients = drawings[0].mean_offsets.grad.abs().amax(-1)
     assert gradients[drawn[0] > 0].max() > 0 and not gradients[drawn[0] == 0].any()
+
+
+def test_a_refinement_drops_nothing():
+    scene, trained = crowded_scene(), PlusMethod(replace(OPTIONS, dropout=0.25))
+    list(trained.fit(scene, Budget(5)))
+    refined = PlusMethod(replace(OPTIONS, dropout=0.25), train=TrainOptions(refine=True))
+    refined.warm_start(trained.state())
+    list(islice(refined.fit(scene, Budget(20)), 3))
+    assert (refined.model.draw(scene.train[0]).gaussians.opacities > 0).all()
 
 
 @pytest.mark.parametrize("at", [13, 28])
