@@ -231,7 +231,7 @@ class Densifier:
         # Not ">=": NaN stays, so that the loop finds and reports it.
         keep = ~(torch.sigmoid(self.splats.opacity_logits) < self.options.min_opacity)
         if self.options.prune_by_extent and iteration > self.options.prune_by_extent_from:
-            keep &= torch.exp(self.splats.log_scales).amax(-1) <= self.options.max_scale * self.extent
+            keep &= ~(torch.exp(self.splats.log_scales).amax(-1) > self.options.max_scale * self.extent)
         keep_rows(self.splats.rows(), optimizer, keep)
         return int((~keep).sum())
 
