@@ -57,7 +57,7 @@ def leave_one_out(
     if options.blending == "hybrid":
         options = replace(options, blending="sorted", core_size=CORE_SIZE)
     if options.cubemap:
-        options = replace(options, cubemap=False, projection="ray", low_pass_kind="auto", bounds="exact")
+        options = replace(options, cubemap=False, projection="ray", low_pass_kind="auto", bounds="exact", wrap=True)
     request = make_request(gaussians, view, options)
     if target.shape != (view.camera.height, view.camera.width, 3):
         raise ValueError(

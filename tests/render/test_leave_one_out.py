@@ -141,5 +141,5 @@ def test_masks_and_other_blendings():
     assert hidden.any() and (found.error[hidden] == 0).all() and (found.peak[hidden] > 0).any()
     cubemap = leave_one_out(gaussians, view, target, weight, RenderOptions("pinhole", cubemap=True))
     assert torch.isfinite(cubemap.error).all()
-    square = RenderOptions("erp", cubemap=True, wrap=False, bounds="square")
+    square = RenderOptions("pinhole", cubemap=True, wrap=False, bounds="square")
     assert torch.equal(leave_one_out(gaussians, view, target, weight, square).change, cubemap.change)
