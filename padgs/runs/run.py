@@ -270,7 +270,7 @@ def judge(result: Result, scene: Scene, iterations: int) -> Result:
     metrics: dict[str, float | None] = {}
     for scores in result.scores.values():
         metrics |= scores.metrics
-        known = {name: view["ws_psnr"] for name, view in scores.views.items() if view.get("ws_psnr") is not None}
+        known = {name: of for name, view in scores.views.items() if (of := view.get("ws_psnr")) is not None}
         if not known or iterations < MIN_ITERATIONS:
             continue
         constants = constant_color_quality(scene, Protocol(**scores.protocol))
