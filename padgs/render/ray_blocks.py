@@ -4,6 +4,7 @@ Native backends bound a Gaussian in panoramas and pinholes by formulas. In other
 pixel. So the image is drawn block by block, each with the Gaussians that reach the cone around its rays.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
@@ -22,8 +23,12 @@ SLACK = 1e-3  # radians, above the rounding of angles in float32
 
 
 def is_in_blocks(camera: Camera) -> bool:
-    """Return whether a camera's image is drawn in blocks: a table of rays that are not learned."""
-    return isinstance(camera, RayTable) and not camera.table.requires_grad
+    """Return whether a camera's image is drawn in blocks: a table of rays that are not learned, and no panorama's."""
+    if not isinstance(camera, RayTable) or camera.table.requires_grad:
+        return False
+    from padgs.render.backends.native import off_panorama
+
+    return off_panorama(camera.table) < 0
 
 
 def rasterize_blocks(rasterize: Backend, request: Request) -> Rendering:
@@ -97,8 +102,9 @@ def _blocks(camera: RayTable) -> tuple[tuple[RayTable, tuple[slice, slice], Tens
     for top in range(0, camera.height, BLOCK):
         for left in range(0, camera.width, BLOCK):
             pixels = slice(top, top + BLOCK), slice(left, left + BLOCK)
-            table = camera.table[pixels].double()
-            axis = torch.nn.functional.normalize(table.mean((0, 1)), dim=0)
-            angle = torch.acos((table @ axis).amin().clamp(-1, 1)).item()
+            rays = camera.table[pixels].double().flatten(0, 1)
+            rays = torch.nn.functional.normalize(rays[rays.isfinite().all(1)], dim=1)  # others spoil their pixel only
+            axis = torch.nn.functional.normalize(rays.mean(0), dim=0) if len(rays) else rays.new_tensor((0, 0, 1))
+            angle = torch.acos((rays @ axis).amin().clamp(-1, 1)).item() if len(rays) else math.pi
             found.append((replace(camera, table=camera.table[pixels].contiguous()), pixels, axis, angle))
     return tuple(found)

@@ -92,9 +92,7 @@ class TrainOptions:
     # measured: in world units, also for initial points. monocular: inverse ranges up to a scale and a shift of each
     # view, which are fitted to each render.
     depth_kind: str = "measured"
-    refine: bool = (
-        False  # with init: neither densify nor prune; learning rates of the model are those of the last fifth
-    )
+    refine: bool = False  # with init: neither densify nor prune; the model's rates are those of the last fifth
     hold_out: int | None = None  # train without a fold of the views: `padgs.training.health.validation_folds`
 
     def __post_init__(self) -> None:

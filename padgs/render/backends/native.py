@@ -211,9 +211,9 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
     if options.projection not in PROJECTIONS:
         known = ", ".join(PROJECTIONS)
         raise ValueError(f"the native libraries do not know projection {options.projection!r}; known: {known}")
-    low_pass, off_panorama = low_pass_of(options, camera), -1.0
+    low_pass, deviation = low_pass_of(options, camera), -1.0
     if isinstance(camera, RayTable):
-        off_panorama = _of_table(_off_panorama, camera.table, camera.table.device)
+        deviation = off_panorama(camera.table)
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
     return NativeCamera(
         camera.width,
@@ -223,11 +223,11 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         (ctypes.c_float * 12)(*cam_from_world[:3].detach().reshape(-1).tolist()),
         options.near,
         low_pass.in_plane,
-        off_panorama >= 0 or (isinstance(camera, Panorama) and (options.wrap or options.projection != "erp")),
+        deviation >= 0 or (isinstance(camera, Panorama) and (options.wrap or options.projection != "erp")),
         options.bounds == "square",
         *lens,
         low_pass.widen,
-        off_panorama,
+        deviation,
         low_pass.compensate,
         options.near_cull == "ellipsoid",
     )
@@ -244,11 +244,15 @@ def _of_table(make: Callable[[Tensor, torch.device], Any], table: Tensor, device
     return values[make][1]
 
 
-def _off_panorama(table: Tensor, device: torch.device) -> float:
+def off_panorama(table: Tensor) -> float:
     """Return the largest angle in radians between the rays of a table and a panorama, or -1 if it is large.
 
     A table that is nearly a panorama has the bounds of a panorama; any other has none.
     """
+    return _of_table(_deviation, table, table.device)
+
+
+def _deviation(table: Tensor, device: torch.device) -> float:
     chord = (table.float() - _panorama_rays(table.shape[1], table.shape[0], device)).norm(dim=-1)
     angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK  # waits for a GPU, once for a table
     return angle if angle < MAX_DEVIATION else -1.0

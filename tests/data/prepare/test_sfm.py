@@ -1,7 +1,6 @@
 """Pairs to match, level worlds, and resources of the machine."""
 
 import errno
-import os
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +72,7 @@ def test_worlds_are_levelled_by_the_smallest_rotation():
 
 def test_threads_are_limited_by_free_memory(monkeypatch):
     assert work.free_memory() > 50_000_000
-    monkeypatch.setattr(os, "cpu_count", lambda: 12)
+    monkeypatch.setattr(work, "cores", lambda: 12)
     free = {"bytes": 2_000_000_000}
     monkeypatch.setattr(work, "free_memory", lambda: free["bytes"])
     assert work.threads_for(2048, 1024) == work.threads_for(512, 256) == 3
