@@ -92,7 +92,7 @@ take() {
     if [ "$jobs" != 1 ]; then run+=(launcher=local run.jobs="$jobs"); fi
     echo "${run[*]}" >>"$out/$step.log"
     status=0
-    "${run[@]}" </dev/null 2>&1 | (trap '' INT TERM; exec tee -a "$out/$step.log") || status=$?
+    "${run[@]}" 9>&- </dev/null 2>&1 | (trap '' INT TERM; exec tee -a "$out/$step.log" 9>&-) || status=$?
     if [ $status -gt 1 ]; then exit $status; fi
     # Status 1 is also that of a run which failed, which is a result.
     if grep ' done' "$out/$step.log" | tail -n 1 | grep -qE 'refused|crashed|killed|elsewhere|waiting|stopped'; then exit 1; fi

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -91,6 +93,22 @@ def test_a_signal_to_the_script_alone_ends_its_runs_and_it_resumes(measure, tmp_
     started.terminate()
     output, _ = started.communicate(timeout=30)
     assert started.returncode == 130 and b"the same command resumes" in output
+    code, output, calls = measure("J-court")
+    assert (code, len(calls)) == (0, 2), output
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="no /proc to find processes in")
+def test_what_a_killed_campaign_left_running_does_not_block_the_next_one(measure, tmp_path):
+    settings = {**os.environ, "BIN": "bin", "CALLS": str(tmp_path / "build/calls"), "WAIT": "8"}
+    script = [tmp_path / "reports" / SCRIPT.name, "J-court"]
+    started = subprocess.Popen(script, env=settings, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not list(tmp_path.glob("build/campaign/runs/*/result.json")):
+        time.sleep(0.05)
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if str(script[0]).encode() in (process / "cmdline").read_bytes():  # not the runs, which go on
+                os.kill(int(process.name), signal.SIGKILL)
+    started.wait(30)
     code, output, calls = measure("J-court")
     assert (code, len(calls)) == (0, 2), output
 
