@@ -1,6 +1,7 @@
 """Runs for a report: the request, the settings among the runs, and what happens to runs that must not be mixed."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from importlib import import_module
@@ -144,6 +145,18 @@ class Setting:
         return [self.variant, *changed] if self.variant else changed
 
 
+def _is_value(stored: Any, text: str) -> bool:
+    """Return whether a text means a stored value.
+
+    >>> _is_value(60.0, "60"), _is_value(True, "true"), _is_value("room", "rooms")
+    (True, True, False)
+    """
+    with suppress(ValueError):
+        if isinstance(stored, (int, float)) and not isinstance(stored, bool):
+            return float(text) == stored
+    return str(stored).casefold() == text.casefold()
+
+
 def select(runs: DataFrame, request: Request) -> DataFrame:
     """Return the runs that a request selects.
 
@@ -175,7 +188,7 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             first = every.iloc[0]
             keys = [name.removeprefix(CONFIG) for name in first.index[first.notna()] if name.startswith(CONFIG)]
             raise ReportError(f"unknown key {key!r}; known in run {first['run']}: {', '.join(keys)}")
-        runs = runs.loc[runs[column].map(str) == value]
+        runs = runs.loc[[_is_value(stored, value) for stored in runs[column]]]
         if runs.empty:
             values = ", ".join(sorted(set(every[column].dropna().map(str))))
             raise ReportError(f"no run has {key}={value}; runs have {values}")
