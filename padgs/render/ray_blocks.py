@@ -95,7 +95,7 @@ def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice],
         yield block, pixels, (everywhere | (away <= reach + angle)).nonzero()[:, 0]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)  # a table takes four times the memory of an image, and views of a camera share one
 def _blocks(camera: RayTable) -> tuple[tuple[RayTable, tuple[slice, slice], Tensor, float], ...]:
     """Return blocks of `BLOCK` x `BLOCK` pixels or fewer, row by row, with axis [3] and half angle of their cones."""
     found = []
