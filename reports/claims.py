@@ -14,7 +14,7 @@ from padgs.reports import REPORTS, methods, published
 from padgs.reports.conditions import as_published, refuse_mixture
 from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
-from padgs.reports.published import DATASETS, NEVER_SEEN, Key, Place, Published
+from padgs.reports.published import DATASETS, NEVER_SEEN, TUNED_ON, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import CONFIDENCE, paired_test
 from padgs.reports.table import MISSING
@@ -176,18 +176,21 @@ def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, fl
 
 
 def findings(run_set: RunSet) -> Page:
-    """Return the page: verdicts in words, a table with the evidence, and the rules."""
+    """Return the page: the verdict of each claim, the evidence, the scenes, and the rules."""
     numbers, tested = published.load(), judge(load(), run_set)
     paper = [one.verdict for one in tested if one.claim.source != OURS]
     every = dict.fromkeys([HOLDS, *sorted(one.verdict for one in tested)])
-    verdicts = {verdict: [one.claim for one in tested if one.verdict == verdict] for verdict in every}
+    numbered = [*enumerate(tested, 1)]
+    verdicts = {verdict: [(no, one.claim) for no, one in numbered if one.verdict == verdict] for verdict in every}
     text = rendered(
         "findings.md.j2",
         paper=paper,
         holding=paper.count(HOLDS),
         failing=sum(verdict.startswith((NOT_REPRODUCED, FAILS)) for verdict in paper),
-        verdicts={verdict: claims for verdict, claims in verdicts.items() if claims},
+        verdicts=verdicts,
+        notes=[(no, one.claim) for no, one in numbered if one.claim.note],
         evidence=[(one, in_the_paper(one.claim, numbers)) for one in tested],
+        marks={"": "", TUNED_ON: " †", NEVER_SEEN: " ‡"},
         missing=MISSING,
         least_seeds=LEAST_SEEDS,
         confidence=CONFIDENCE,
