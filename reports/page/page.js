@@ -1,5 +1,5 @@
 "use strict";
-// Sorting, and the choice of test views; the libraries above do the rest.
+// Sorting, the choice of scenes, and the choice of test views; the libraries above do the rest.
 
 for (const table of document.querySelectorAll("table.sortable")) new Tablesort(table);
 
@@ -11,6 +11,38 @@ function url(number) { // a blob, so that an image is decoded once and the viewe
     urls[number] = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
   }
   return urls[number];
+}
+
+// What is about other scenes than the chosen ones is hidden, and sections of which nothing is left.
+const sets = document.getElementById("set");
+sets.append(...Object.keys(data.sets).map((title) => new Option(title)));
+sets.addEventListener("change", () => {
+  const names = (data.sets[sets.value] ?? []).map((name) => name.replace(/[.*+?^${}()|[\]\\\/]/g, "\\$&"));
+  const wanted = new RegExp(names.length ? `(?<![\\p{L}\\p{N}_-])(?:${names.join("|")})(?![\\p{L}\\p{N}_-])` : "", "u");
+  for (const part of document.querySelectorAll("[data-of]")) part.hidden = !wanted.test(part.dataset.of);
+  for (const section of document.querySelectorAll("section:has([data-of])")) {
+    section.hidden = !section.querySelector("[data-of]:not([hidden])");
+  }
+  for (const more of document.querySelectorAll(".more")) more.open = names.length > 0;
+});
+
+// The numbers of the shown tables of a section, a line for each cell.
+for (const link of document.querySelectorAll("a[download]")) {
+  link.addEventListener("click", () => {
+    const lines = [["block", "row", "column", "value", "text"]];
+    for (const table of link.closest("section").querySelectorAll("[data-of]:not([hidden]) table")) {
+      const columns = [...table.tHead.rows].at(-1).cells;
+      for (const row of table.tBodies[0].rows) {
+        for (const cell of [...row.cells].slice(1)) {
+          const value = cell.dataset.sort === "-1e99" ? "" : cell.dataset.sort;
+          const column = columns[cell.cellIndex].textContent;
+          lines.push([table.caption.textContent, row.cells[0].textContent, column, value, cell.textContent]);
+        }
+      }
+    }
+    const text = lines.map((line) => line.map((word) => `"${word.trim().replaceAll('"', '""')}"`).join(",")).join("\r\n");
+    link.href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+  });
 }
 
 if (data.scenes.length) {

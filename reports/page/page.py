@@ -18,6 +18,7 @@ from padgs.reports import REPORTS
 from padgs.reports.build import PAPER_COLUMNS
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
+from padgs.reports.published import TITLES
 from padgs.reports.selection import RunSet, Setting, settings
 from padgs.reports.store import render_names, split_image
 from padgs.reports.table import Block, Cell, Column, ReportError, Table
@@ -61,13 +62,15 @@ def html(run_set: RunSet) -> str:
             refused.append(str(error))
             report = []
         made[name] = report if isinstance(report, list) else [report]
-    tables = [part for parts in made.values() for part in parts if isinstance(part, Table)]
+    tables = [_measured(part) for parts in made.values() for part in parts if isinstance(part, Table)]
     views = album(run_set)
+    scenes = {"images": views.images, "scenes": views.scenes, "sets": _scene_sets(run_set.runs)}
     return rendered(
         "page/page.html.j2",
+        summary=_summary(run_set.runs),
         facts=_facts(run_set.runs),
         problems=[*run_set.left_out, *refused, *run_set.warnings],
-        tables=[shown for table in tables if (shown := _measured(table)).blocks],
+        tables=sorted((table for table in tables if table.blocks), key=lambda table: table.name != "equal_time"),
         rows_of=rows_of,
         spans=_spans,
         maps=_charts(made["stability"]),
@@ -76,7 +79,7 @@ def html(run_set: RunSet) -> str:
         ),
         sweeps=_charts(made["sweep"]),
         views=views,
-        data=json.dumps({"images": views.images, "scenes": views.scenes}).replace("<", "\\u003c"),  # no end of script
+        data=json.dumps(scenes).replace("<", "\\u003c"),  # no end of script
         styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text()]),
         scripts=[*(_vendored(name) for name in SCRIPTS), (HERE / "page.js").read_text()],
         notice=_vendored("NOTICE.md"),
@@ -141,11 +144,25 @@ def _spread(names: Sequence[str], count: int) -> list[str]:
     return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
 
 
+def _summary(runs: DataFrame) -> str:
+    counts = f"{runs['scene'].nunique()} scenes, {runs['preset'].nunique()} methods"
+    versions = f"{runs['code_version'].nunique()} versions of the code"
+    return f"{len(runs)} runs, of which {(~runs['ok']).sum()} failed; {counts}, {versions}"
+
+
 def _facts(runs: DataFrame) -> list[tuple[str, str]]:
     columns = {"Scenes": "scene", "Methods": "preset", "Code": "code_version", "Machines": "hardware"}
-    facts = [("Runs", f"{len(runs)}, of which {(~runs['ok']).sum()} failed")]
-    facts += [(name, ", ".join(sorted(runs[column].unique()))) for name, column in columns.items()]
+    facts = [(name, ", ".join(sorted(runs[column].unique()))) for name, column in columns.items()]
     return [*facts, ("Last run", max(runs["finished"], default="none"))]
+
+
+def _scene_sets(runs: DataFrame) -> dict[str, list[str]]:
+    """Return title -> names of scenes: those never seen and tuned on, each data set, and each scene."""
+    sets: dict[str, list[str]] = {}
+    for place in by_place(runs):
+        for title in filter(None, (place.seen, TITLES.get(place.dataset, place.dataset))):
+            sets.setdefault(title, []).append(place.scene)
+    return sets | {place.heading: [place.scene] for place in by_place(runs)}
 
 
 def _measured(table: Table) -> Table:

@@ -1,3 +1,4 @@
+import csv
 import re
 import time
 from dataclasses import replace
@@ -41,6 +42,14 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
 def test_the_mean_after_equal_time_is_the_first_chart():
     html = page.html(run_set(at_equal_time("synthetic-room", "synthetic-outdoor")))
     assert "mean over synthetic-outdoor, synthetic-room" in html.partition('<figure class="chart"')[2][:2000]
+
+
+def test_scenes_can_be_chosen_by_set_and_by_name():
+    own = [replace(one, dataset="", scene="plaza", run=f"own{one.run}") for one in compared(["synthetic-room"], 1)]
+    runs = run_set([*compared(["synthetic-room", "synthetic-outdoor"], 1), *own]).runs
+    sets = page._scene_sets(runs)
+    assert sets["never seen"] == ["plaza"] and sets["synthetic-room"] == ["synthetic-room"]
+    assert sorted(sets["synthetic"]) == ["synthetic-outdoor", "synthetic-room"]
 
 
 def test_names_are_text_and_not_markup():
@@ -118,6 +127,20 @@ def test_in_a_browser(html, tmp_path):
         page.select_option("#method", index=5)
         visit.wait("viewers.every(viewer => viewer.isLoaded())")
         assert page.locator("#slider [slot=second] figcaption").text_content() == "EgoNeRF, PSNR 22.00 dB"
+
+        shown = "[...document.querySelectorAll('#table1 [data-of]')].map(part => part.hidden)"
+        page.select_option("#set", label="synthetic-room")
+        assert page.evaluate(shown) == [False]
+        with page.expect_download() as saved:
+            page.locator("#table1 a[download]").click()
+        numbers = list(csv.DictReader(saved.value.path().read_text("utf-8").splitlines()))
+        psnr = {line["row"]: line["value"] for line in numbers if line["column"].startswith("PSNR")}
+        assert float(psnr["PaD-GS"]) == pytest.approx(26.0) and float(psnr["EgoNeRF"]) == pytest.approx(22.0)
+        page.evaluate("document.querySelector('#table1 [data-of]').dataset.of = 'a-synthetic-room (generated)'")
+        page.select_option("#set", label="synthetic")
+        assert page.evaluate(shown) == [True] and not page.locator("#table1").is_visible()
+        page.select_option("#set", label="all scenes")
+        assert page.evaluate(shown) == [False] and page.locator("#table1").is_visible()
 
         assert visit.complaints == []
         assert {url.partition(":")[0] for url in visit.requests} <= {"file", "blob", "data"}
