@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
@@ -50,20 +50,23 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     target = options.width
     if target is None and capture.width is not None and images[0].width > capture.width:
         target = capture.width
-    factor = 1.0 if target is None else target / images[0].width
-    sizes = [
-        _view_size(image, target) if frame.lens is None else _reduced(image, factor)
-        for frame, image in zip(capture.frames, images, strict=True)
+    factor = 1.0 if target is None else target / images[0].width  # of photographs beside panoramas
+    sizes = [_view_size(image, target) for image in images[:panoramas]]
+    sizes += [
+        (max(MIN_SIDE, round(factor * image.width)), max(MIN_SIDE, round(factor * image.height)))
+        for image in images[panoramas:]
     ]
     whole = zip(images[:panoramas], sizes, strict=False)
-    reduced = {(image.width, image.height) for image, size in whole if size[0] < image.width}
-    if reduced:
+    if reduced := {(image.width, image.height) for image, size in whole if size[0] < image.width}:
         stored = listed(f"{width}x{height}" for width, height in sorted(reduced))
         notes.append(f"images: reduced from {stored} to {target}x{sizes[0][1]} by an area filter")
     if panoramas < len(frames):
         use = "left out (data.cameras=panoramas)" if left_out else "used, each by the share of the sphere that it shows"
         notes.append(f"cameras: {len(frames) - panoramas} of {len(frames)} images are no panoramas; they are {use}")
-    unposed = _unposed(replace(capture, frames=tuple(frames)))
+    unposed: list[str] = []
+    if capture.image_folder != capture.folder:  # which may hold masks and other images too
+        posed = {frame.image for frame in frames}
+        unposed = [name for name in image_names(capture.image_folder) if capture.image_folder / name not in posed]
     if unposed:
         notes.append(f"{len(unposed)} images have no pose and are not used: {listed(unposed)}")
     rules = {"mode": options.split, "every": options.test_every, "stated": capture.split}
@@ -123,11 +126,6 @@ def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]
     if 2 * size > free:
         return None, [f"images: {gigabytes} and half of the free space of {folder}; each is decoded when it is needed"]
     return folder, [f"images: {gigabytes}, they are kept in {folder} (data.disk_cache; it may be deleted)"]
-
-
-def view_name(frame_name: str) -> str:
-    """Return a view's name: its image's path in the image folder, without extension."""
-    return str(PurePosixPath(frame_name).with_suffix(""))
 
 
 def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_FOLDERS) -> Path:
@@ -232,13 +230,6 @@ def _refuse_missing(capture: Capture) -> None:
     raise DataError(f"{lost}: {listed(absent)}; {remedy}")
 
 
-def _unposed(capture: Capture) -> list[str]:
-    if capture.image_folder == capture.folder:  # may hold masks and other images too
-        return []
-    posed = {frame.image for frame in capture.frames}
-    return [name for name in image_names(capture.image_folder) if capture.image_folder / name not in posed]
-
-
 def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[str]:
     """Check that all panoramas have the size of their camera, or differ from it by one common factor."""
     scales: dict[float, str] = {}
@@ -260,11 +251,6 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
         differ = "; but ".join(list(scales.values())[:2])
         raise DataError(f"images and cameras disagree in size: {differ}; make them agree")
     return [f"images: {text}; used as they are" for scale, text in scales.items() if scale != 1]
-
-
-def _reduced(image: ImageFile, factor: float) -> tuple[int, int]:
-    """Return the size of a photograph beside panoramas that are reduced by a factor."""
-    return max(MIN_SIDE, round(factor * image.width)), max(MIN_SIDE, round(factor * image.height))
 
 
 def _view_size(image: ImageFile, width: int | None) -> tuple[int, int]:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from padgs.checks import unknown
 from padgs.geometry.camera import Camera
 
 
@@ -40,6 +41,12 @@ def refuse_special(path: Path) -> None:
         raise DataError(f"{path} cannot be read: it is no regular file; replace or remove it")
 
 
+def files_with(folder: Path, suffix: str) -> list[Path]:
+    """Return the files in a folder with a suffix in any case, sorted, without hidden ones."""
+    files = (file for file in folder.glob("*") if file.suffix.lower() == suffix and not file.name.startswith("."))
+    return sorted(file for file in files if file.is_file())
+
+
 _NUMBER = re.compile(r"(\d+)")
 
 
@@ -52,6 +59,11 @@ def natural_key(name: str) -> tuple[list[Any], str]:
     parts: list[Any] = _NUMBER.split(name)
     parts[1::2] = map(int, parts[1::2])
     return parts, name
+
+
+def view_name(frame_name: str) -> str:
+    """Return a view's name: its image's path in the image folder, without extension."""
+    return str(PurePosixPath(frame_name).with_suffix(""))
 
 
 @dataclass(frozen=True)
@@ -94,10 +106,6 @@ class Tracks:
         frame, point = torch.from_numpy(ids[finite := np.isfinite(pixels).all(1)].T.copy())
         return cls(frame, point, torch.from_numpy(pixels[finite]))
 
-    def thinned(self, count: int) -> Tracks:
-        """Return about `count` observations, evenly spaced."""
-        return self.at(slice(None, None, max(1, len(self.frame) // count)))
-
     def at(self, some: slice | Tensor) -> Tracks:
         """Return some of the observations."""
         return Tracks(self.frame[some], self.point[some], self.pixels[some])
@@ -138,8 +146,7 @@ class Capture:
     readings: tuple[Reading, ...] = ()  # the first is the usual one; see `padgs.data.conventions.best_reading`
 
 
-SPLITS = ("auto", "files", "every", "all")
-CAMERAS = ("all", "panoramas")
+_CHOICES = {"split": ("auto", "files", "every", "all"), "depth": ("auto", "none"), "cameras": ("all", "panoramas")}
 
 
 @dataclass(frozen=True)
@@ -161,12 +168,9 @@ class DataSettings:
     generator: Mapping[str, Any] = field(default_factory=dict)  # options of the synthetic scene
 
     def __post_init__(self) -> None:
-        if self.split not in SPLITS:
-            raise DataError(f"unknown data.split {self.split!r}; known: {', '.join(SPLITS)}")
-        if self.depth not in ("auto", "none"):
-            raise DataError(f"unknown data.depth {self.depth!r}; known: auto, none")
-        if self.cameras not in CAMERAS:
-            raise DataError(f"unknown data.cameras {self.cameras!r}; known: {', '.join(CAMERAS)}")
+        for name, known in _CHOICES.items():
+            if (value := getattr(self, name)) not in known:
+                raise DataError(unknown(f"data.{name}", value, known))
         if self.test_every < 2:
             raise DataError(f"data.test_every is {self.test_every}; every k-th view is a test view, with k at least 2")
         if self.width is not None and (self.width < 8 or self.width % 2):

@@ -13,7 +13,7 @@ from torch import Tensor
 import padgs.data
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
-from padgs.data.capture import Capture, DataError, DataOptions, listed
+from padgs.data.capture import Capture, DataError, DataOptions, listed, view_name
 from padgs.data.conventions import (
     MIN_CORRELATION,
     MIN_GAIN,
@@ -87,7 +87,7 @@ def check(
         report.problems.append(str(error))
         return report
     report.format = capture.format
-    _check_images(capture, report, progress)
+    digests = _check_images(capture, report, progress)
     damaged = bool(report.problems)
     scene = _assemble(capture, options, report)
     if scene is None:
@@ -109,7 +109,7 @@ def check(
         text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "
         text += "255 means use, 0 means ignore: repair them, or set data.mask (--mask) to none, inverted or a folder"
         (report.problems if options.mask == "auto" else report.notes).append(text)
-    _check_leaks(scene, capture, report)
+    _check_leaks(scene, digests, report)
     if report.path_length == 0 and len(poses) > 1:
         report.problems.append("all cameras have the same centre; depth cannot be learned")
     if damaged:  # the fit needs readable pixels
@@ -149,18 +149,20 @@ def _check_depth(scene: Scene, report: Report) -> None:
     )
 
 
-def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> None:
-    """Decode all images, so that damaged files are found before training."""
+def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> dict[str, str]:
+    """Decode all images, so that damaged files are found before training; return the digests of files by view."""
+    digests = {}
     for done, frame in enumerate(capture.frames):
         if frame.image.is_file():  # missing ones are reported together
             try:
-                inspect(frame.image, panorama=frame.lens is None)
+                digests[view_name(frame.name)] = inspect(frame.image, panorama=frame.lens is None).digest
                 pixels = decode(frame.image)
                 if frame.lens is None:
                     refuse_dual_fisheye(pixels, frame.image)
             except DataError as error:
                 report.problems.append(str(error))
         progress(done + 1, len(capture.frames))
+    return digests
 
 
 def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
@@ -182,13 +184,11 @@ def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene |
     return None
 
 
-def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
+def _check_leaks(scene: Scene, digests: dict[str, str], report: Report) -> None:
     """Find test views that are identical or close to training views."""
-    files = {frame.name.rpartition(".")[0]: frame.image for frame in capture.frames}
-    digests = {inspect(files[view.name], panorama=view.lens is None).digest: view.name for view in scene.train}
+    trained = {digests[view.name]: view.name for view in scene.train}
     for view in scene.test:
-        twin = digests.get(inspect(files[view.name], panorama=view.lens is None).digest)
-        if twin is not None:
+        if twin := trained.get(digests[view.name]):
             both = f"the test view {view.name} is the same image as the training view {twin}"
             report.problems.append(f"{both}; remove one of them")
     if not scene.test:
@@ -224,7 +224,7 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
                 f"the median reprojection error is {report.reprojection_median:.1f} pixels; it must be at most "
                 f"{limit:.1f} at this size"
             )
-            some = tracks.thinned(POINTS)
+            some = tracks.at(slice(None, None, max(1, len(tracks.frame) // POINTS)))
             candidates = (convention.convert(poses.double()) for convention in conventions)
             errors = [reprojection_errors(pose, points, some, width, height).median().item() for pose in candidates]
             if min(errors) <= limit:

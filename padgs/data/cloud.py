@@ -1,5 +1,6 @@
 """Point clouds: PLY files through plyfile, and the cloud from which training starts."""
 
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,14 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     vertex = np.rec.fromarrays(columns, dtype=fields)
     with atomic_path(path) as draft:
         PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(draft))
+
+
+def joined(clouds: Sequence[Cloud]) -> Cloud:
+    """Return the points of several clouds as one; it has colours if all clouds with points have them."""
+    clouds = [cloud for cloud in clouds if len(cloud.points)]
+    colors = [cloud.colors for cloud in clouds if cloud.colors is not None]
+    points = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(cloud.points for cloud in clouds)])
+    return Cloud(points, torch.cat(colors) if colors and len(colors) == len(clouds) else None)
 
 
 RANDOM_POINTS = 100_000

@@ -76,26 +76,21 @@ def best_reading(capture: Capture) -> Capture:
         for i, reading in enumerate(capture.readings)
         if not any(reading.axes.equal(one.axes) and reading.world.equal(one.world) for one in capture.readings[:i])
     ]
-    if not readings or (len(readings) > 1 and capture.cloud is None):
+    if not readings or not capture.frames or (len(readings) > 1 and capture.cloud is None):
         return replace(capture, readings=())
-    poses, cloud, best = torch.stack([frame.cam_from_world for frame in capture.frames]), capture.cloud, readings[0]
-    notes = list(capture.notes)
+    cloud, best, notes = capture.cloud, readings[0], list(capture.notes)
     if len(readings) > 1 and cloud is not None:
-        step = max(1, len(poses) // VIEWS)
-        fits = [0.0]
+        some, fits = capture.frames[:: max(1, len(capture.frames) // VIEWS)][:VIEWS], [0.0]
+        poses = torch.stack([frame.cam_from_world for frame in some])
         with suppress(DataError):  # missing and damaged images are reported later
-            images = small_images(decode(frame.image) for frame in capture.frames[::step][:VIEWS])
-            if cloud.colors is not None:
-                fits = [
-                    colour_fit(one.axes @ poses[::step][:VIEWS], images, _moved(cloud.points, one), cloud.colors)
-                    for one in readings
-                ]
+            images = small_images(decode(frame.image) for frame in some)
+            if (colors := cloud.colors) is not None:
+                fits = [colour_fit(one.axes @ poses, images, _moved(cloud.points, one), colors) for one in readings]
         if max(fits) > max(MIN_CORRELATION, fits[0] + MIN_GAIN):
             best = readings[fits.index(max(fits))]
         why = f"colours agree by {max(fits):.2f}" if max(fits) > MIN_CORRELATION else "not tested by colours"
         notes.append(f"{best.words}: {why}")
-    posed = zip(capture.frames, poses, strict=True)
-    frames = (replace(frame, cam_from_world=best.axes @ pose) for frame, pose in posed)
+    frames = (replace(frame, cam_from_world=best.axes @ frame.cam_from_world) for frame in capture.frames)
     cloud = cloud and replace(cloud, points=_moved(cloud.points, best))
     return replace(capture, frames=tuple(frames), cloud=cloud, notes=tuple(notes), readings=())
 
@@ -117,10 +112,8 @@ def known_conventions() -> list[Convention]:
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
         "the rotations are transposed: transpose them and keep the centres": _transposed,
-        "the translations are camera centres: use t = -R t": lambda p: _with(
-            p, p[:, :3, :3], -p[:, :3, :3] @ p[:, :3, 3:]
-        ),
-        "the camera centres are translations: use C = -R^T C": lambda p: _with(p, p[:, :3, :3], centers(p)[..., None]),
+        "the translations are camera centres: use t = -R t": lambda p: _with(p, -p[:, :3, :3] @ p[:, :3, 3:]),
+        "the camera centres are translations: use C = -R^T C": lambda p: _with(p, centers(p)[..., None]),
         "the quaternions are in the order x y z w: write them as w x y z": _reordered,
     }
     same, *others = _signed_axes()
@@ -150,7 +143,7 @@ def _signed_axes() -> Iterator[tuple[str, Tensor]]:
 
 def _transposed(poses: Tensor) -> Tensor:
     transposed = poses[:, :3, :3].mT
-    return _with(poses, transposed, -transposed @ centers(poses)[..., None])
+    return _with(poses, -transposed @ centers(poses)[..., None], transposed)
 
 
 def _reordered(poses: Tensor) -> Tensor:
@@ -160,12 +153,12 @@ def _reordered(poses: Tensor) -> Tensor:
     if torch.linalg.det(poses[:, :3, :3]).min() <= 0:
         return poses
     stated = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat()[:, [3, 0, 1, 2]]
-    return _with(poses, torch.from_numpy(Rotation.from_quat(stated).as_matrix()), poses[:, :3, 3:])
+    return _with(poses, poses[:, :3, 3:], torch.from_numpy(Rotation.from_quat(stated).as_matrix()))
 
 
-def _with(poses: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+def _with(poses: Tensor, translation: Tensor, rotation: Tensor | None = None) -> Tensor:
     out = poses.clone()
-    out[:, :3, :3], out[:, :3, 3:] = rotation, translation
+    out[:, :3, :3], out[:, :3, 3:] = poses[:, :3, :3] if rotation is None else rotation, translation
     return out
 
 

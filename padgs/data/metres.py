@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from PIL import ExifTags
 from torch import Tensor
 
 from padgs.data.camera_paths import centers, gravity
-from padgs.data.capture import Cloud, DataError, Frame, listed
+from padgs.data.capture import Cloud, DataError, Frame, listed, view_name
 from padgs.files import open_image
 from padgs.geometry.similarity import Similarity
 
@@ -86,15 +86,11 @@ def unit_note(folder: Path) -> list[str]:
     return [note] if isinstance(note, str) else []
 
 
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix(""))
-
-
 def _by_distance(
     frames: Sequence[Frame], poses: Tensor, first: str, second: str, metres: float
 ) -> tuple[Similarity, str]:
-    names = {name: k for k, frame in enumerate(frames) for name in (frame.name, _stem(frame.name))}
-    at = [names.get(name, names.get(_stem(name))) for name in (first, second)]  # "convert" may change the extension
+    names = {name: k for k, frame in enumerate(frames) for name in (frame.name, view_name(frame.name))}
+    at = [names.get(name, names.get(view_name(name))) for name in (first, second)]  # "convert" may change the extension
     for name, index in zip((first, second), at, strict=True):
         if index is None:
             known = listed(frame.name for frame in frames)
@@ -154,16 +150,16 @@ def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[Simil
 
 def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     """Fit heading, scale and place of the world, upright by the cameras, to east, north and up."""
-    found = [(k, place) for k, frame in enumerate(frames) if (place := gps_of(frame.image)) is not None]
+    found = {k: place for k, frame in enumerate(frames) if (place := gps_of(frame.image)) is not None}
     instead = "; use --metres A B DISTANCE or --camera-height"
-    if (different := len({place[:2] for _, place in found})) < 3:
+    if (different := len({place[:2] for place in found.values()})) < 3:
         raise DataError(
             f"--gps: {len(found)} of {len(frames)} images have a GPS position, {different} different ones, and "
             f"at least 3 are needed{instead}"
         )
-    origin, truth = local_metres([place for _, place in found])
+    origin, truth = local_metres([*found.values()])
     level = Similarity.turning(_common_up(poses, "--gps"), Z).rotation
-    used = centers(poses)[[k for k, _ in found]]
+    used = centers(poses)[[*found]]
     at = used @ level.mT
     theirs, ours = (torch.complex(of[:, 0], of[:, 1]) for of in (truth, at))
     theirs, ours = theirs - theirs.mean(), ours - ours.mean()
@@ -203,11 +199,12 @@ def gps_of(image: Path) -> tuple[float, float, float] | None:
             )
         ]
         altitude = float(tags.get(ExifTags.GPS.GPSAltitude, 0.0))
+        altitude = altitude if math.isfinite(altitude) else 0.0  # some cameras write 0/0
         if tags.get(ExifTags.GPS.GPSAltitudeRef) in (b"\x01", 1):  # below the sea
             altitude = -altitude
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
-    is_place = all(map(math.isfinite, (*angles, altitude))) and abs(angles[0]) <= 90 and abs(angles[1]) <= 180
+    is_place = all(map(math.isfinite, angles)) and abs(angles[0]) <= 90 and abs(angles[1]) <= 180
     return (angles[0], angles[1], altitude) if is_place and any(angles) else None
 
 

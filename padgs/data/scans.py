@@ -12,7 +12,7 @@ import torch
 
 from padgs.checks import install_command
 from padgs.data.capture import Cloud, DataError, refuse_special
-from padgs.data.cloud import color_bytes
+from padgs.data.cloud import color_bytes, joined
 
 MOST_POINTS = 1_000_000  # of a scan; more are thinned out evenly, because training starts from each of them
 CHUNK = 1_000_000  # points in memory at a time
@@ -75,7 +75,7 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
         _check_header(path)
         points, colors, step = _las_points(laspy.open(path, laz_backend=decoders), path)
     paint = None if colors is None else color_bytes(colors, str(path))
-    return _thinned(path, points, paint, step)
+    return _thinned(path, Cloud(torch.from_numpy(points), paint), step)
 
 
 def _las_points(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
@@ -100,13 +100,7 @@ def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:
     with open_e57(path) as file:
         headers = [file.get_header(index) for index in range(file.scan_count)]
         step = -(-sum(header.point_count for header in headers) // MOST_POINTS) or 1
-        points, colors = [np.zeros((0, 3))], []
-        for header in headers:
-            found, paint = _scan(file, header, step)
-            points.append(found)
-            colors.append(paint if len(found) else np.zeros((0, 3), np.uint8))
-    coloured = bool(colors) and all(paint is not None for paint in colors)
-    return _thinned(path, np.concatenate(points), torch.from_numpy(np.concatenate(colors)) if coloured else None, step)
+        return _thinned(path, joined([_scan(file, header, step) for header in headers]), step)
 
 
 @contextmanager
@@ -121,8 +115,8 @@ def open_e57(path: Path) -> Iterator[Any]:
             file.close()
 
 
-def _scan(file: Any, header: Any, step: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return every `step`-th valid point [P, 3] of a scan in the file's frame, and its colours [P, 3]."""
+def _scan(file: Any, header: Any, step: int) -> Cloud:
+    """Return every `step`-th valid point of a scan in the file's frame."""
     lib, fields = import_module("pye57").libe57, set(header.point_fields)
     spherical = "cartesianX" not in fields
     axes = [f"spherical{name}" for name in ("Range", "Azimuth", "Elevation")]
@@ -150,15 +144,14 @@ def _scan(file: Any, header: Any, step: int) -> tuple[np.ndarray, np.ndarray | N
         found = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), radius * np.sin(elevation)], axis=1)
     if header.has_pose():
         found = file.to_global(found, header.rotation, header.translation)
-    if not coloured:
-        return found, None
+    if not coloured or not len(found):
+        return Cloud(torch.from_numpy(found), None)
     values, kind = np.concatenate(colors), lib.StructureNode(header.points.prototype())[paint[0]]
     if isinstance(kind, lib.IntegerNode):
         fits = (whole for whole in (np.uint8, np.uint16) if kind.maximum() <= np.iinfo(whole).max)
         values = values.astype(next(fits, np.uint32))
-    return found, color_bytes(values, f"scan {header.guid}").numpy()
+    return Cloud(torch.from_numpy(found), color_bytes(values, f"scan {header.guid}"))
 
 
-def _thinned(path: Path, points: np.ndarray, colors: Any, step: int) -> tuple[Cloud, tuple[str, ...]]:
-    notes = (f"points: every {step}th of {path.name}, {len(points)} in all",) if step > 1 else ()
-    return Cloud(torch.from_numpy(points), colors), notes
+def _thinned(path: Path, cloud: Cloud, step: int) -> tuple[Cloud, tuple[str, ...]]:
+    return cloud, (f"points: every {step}th of {path.name}, {len(cloud.points)} in all",) if step > 1 else ()

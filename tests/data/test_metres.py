@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from support.fixtures import World, write_colmap_text
 from typer.testing import CliRunner
 
@@ -126,6 +127,14 @@ def test_gps_turns_the_world_to_east_and_north(tmp_path):
 def test_gps_that_does_not_give_the_scale_is_refused(changes, message, tmp_path):
     with pytest.raises(DataError, match=f"--gps: .*{message}.*use --metres A B DISTANCE or --camera-height"):
         to_metres(with_gps(cameras(), tmp_path, **changes), None, KnownLength(gps=True))
+
+
+def test_gps_without_altitude_is_a_position(tmp_path):
+    exif = Image.Exif()
+    place = ("N", (48.0, 30.0, 0.0), "W", (9.0, 15.0, 0.0), b"\0", IFDRational(0, 0))
+    exif.get_ifd(0x8825).update(dict(enumerate(place, 1)))
+    Image.new("RGB", (32, 16)).save(tmp_path / "a.jpg", exif=exif)
+    assert gps_of(tmp_path / "a.jpg") == (48.5, -9.25, 0.0)
 
 
 def test_local_metres_agree_with_the_ellipsoid():

@@ -7,6 +7,7 @@ from padgs.data.capture import DataError, listed
 from padgs.data.formats.colmap import find_model
 from padgs.data.formats.metashape import find_xml
 
+E57 = "*.[eE]57"
 # Files that together identify a format, most specific first: folders of published data sets also hold files of general
 # formats. No files: a COLMAP model.
 SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -24,18 +25,10 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("metashape", ("*.xml",)),
     ("navvis", ("pano-poses.csv",)),
     ("navvis", ("pano/pano-poses.csv",)),
-    ("e57", ("*.e57",)),
+    ("e57", (E57,)),
 )
 # Files that may be given instead of their folder.
-ALONE = (
-    "transform.json",
-    "transforms.json",
-    "sfm_data.json",
-    "reconstruction.json",
-    "*.xml",
-    "pano-poses.csv",
-    "*.e57",
-)
+ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json", "*.xml", "pano-poses.csv", E57)
 
 
 def detect(path: Path) -> tuple[str, str]:

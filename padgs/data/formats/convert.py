@@ -3,13 +3,13 @@
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import torch
 
 import padgs.data
-from padgs.data.assemble import assemble, view_name
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
+from padgs.data.assemble import assemble
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
@@ -30,22 +30,11 @@ def convert(
     known: KnownLength = KnownLength(),  # noqa: B008
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scene:
-    """Write a data set in another format.
+    """Write a data set in the format `to` of `padgs.data.formats.writers.WRITERS`, and return the scene of the source.
 
     Images are copied byte for byte, unless they are reduced (`options.width`), padded or converted to sRGB. The split
-    is written as decided; masks, including the row rule of 360Roam, become mask.png or masks/.
-
-    Args:
-        source: a data set in any known format.
-        destination: a folder that does not exist, or is empty.
-        to: a name of `padgs.data.formats.writers.WRITERS`.
-        format: of the source, or auto.
-        options: as for `padgs.data.load`.
-        known: what sets the scale of the written world.
-        progress: called with (images written, total).
-
-    Returns:
-        The scene of the source.
+    is written as decided; masks, including the row rule of 360Roam, become mask.png or masks/. `known` sets the scale
+    of the written world. `progress` is called with (images written, total).
 
     Raises:
         DataError: `load` would refuse the source, or the destination cannot be written; then it stays unchanged.
@@ -66,15 +55,14 @@ def convert(
                 # In the world of the poses: the scene may be recentered.
                 points, colors, _ = initial_cloud(capture, options.points)
                 content = replace(content, cloud=Cloud(points, colors), tracks=None)
-            scale = 1.0
+            scale, notes = 1.0, unit_note(capture.folder)
             if found := to_metres(content.frames, content.cloud, known):
                 change, note = found
                 scale, (frames, cloud) = change.scale, moved(content.frames, content.cloud, change)
-                content = replace(content, frames=frames, cloud=cloud)
+                content, notes = replace(content, frames=frames, cloud=cloud), [note]
                 scene = replace(scene, notes=(*scene.notes, note))
+            for note in notes:
                 write_unit(partial, note)
-            elif notes := unit_note(capture.folder):
-                write_unit(partial, notes[0])
             write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
             write_depths((*scene.train, *scene.test), partial, scale)
             WRITERS[to](content, partial)
@@ -89,34 +77,28 @@ def convert(
 def _write_images(capture: Capture, scene: Scene, target: Path, progress: Callable[[int, int], None]) -> Content:
     """Copy or re-encode the images, and return the content of the files beside them."""
     views = {view.name: view for view in (*scene.train, *scene.test)}
-    frames: list[Frame] = []
-    renamed: dict[str, str] = {}  # view name -> new frame name
+    frames: dict[str, Frame] = {}  # by view
     kept = [i for i, frame in enumerate(capture.frames) if view_name(frame.name) in views]
     for done, i in enumerate(kept):
         frame = capture.frames[i]
         view = views[view_name(frame.name)]
-        image = inspect(frame.image)
-        changed = image.width != view.width or image.crop is not None or image.converted
-        name = str(PurePosixPath(frame.name).with_suffix(".png")) if changed else frame.name
-        if changed:
+        image, name = inspect(frame.image), frame.name
+        if image.width != view.width or image.crop is not None or image.converted:
             assert view.load_pixels is not None
+            name = f"{view.name}.png"
             save_png(view.load_pixels(), target / name)
         else:
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(frame.image, target / name)
-        frames.append(replace(frame, name=name, width=view.width, height=view.height, mask=None))
-        renamed[view.name] = name
+        frames[view.name] = replace(frame, name=name, width=view.width, height=view.height, mask=None)
         progress(done + 1, len(kept))
-    split = {"train": scene.train, "test": scene.test} if scene.test else {}
-    return Content(
-        frames=tuple(frames),
-        cloud=capture.cloud,
-        tracks=_kept_tracks(capture, kept, frames),
-        split={side: tuple(renamed[view.name] for view in part) for side, part in split.items()},
-    )
+    sides = {"train": scene.train, "test": scene.test} if scene.test else {}
+    split = {side: tuple(frames[view.name].name for view in part) for side, part in sides.items()}
+    written = tuple(frames.values())
+    return Content(written, capture.cloud, _kept_tracks(capture, kept, written), split)
 
 
-def _kept_tracks(capture: Capture, kept: list[int], frames: list[Frame]) -> Tracks | None:
+def _kept_tracks(capture: Capture, kept: list[int], frames: tuple[Frame, ...]) -> Tracks | None:
     """Return the observations in the written frames, in pixels of the written images."""
     if capture.tracks is None or any(frame.width is None for frame in capture.frames):
         return None

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, listed
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, files_with, listed
 from padgs.data.cloud import read_ply
-from padgs.data.formats.poses import cam_from_pose, checked_rotation
+from padgs.data.formats.poses import cam_from_pose, checked_rotation, rigid
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_name
 
@@ -27,7 +27,7 @@ def find_xml(path: Path) -> Path | None:
     """Return the file of cameras: `path` itself, cameras.xml in it, or the only XML file with a chunk in it."""
     if path.is_file() or (path / "cameras.xml").exists():
         return path if path.is_file() else path / "cameras.xml"
-    found = [file for file in sorted(path.glob("*.xml")) if file.is_file() and b"<chunk" in file.read_bytes()[:4096]]
+    found = [file for file in files_with(path, ".xml") if b"<chunk" in file.read_bytes()[:4096]]
     return found[0] if len(found) == 1 else None
 
 
@@ -64,7 +64,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     sizes = _sizes(chunk, {camera.get("sensor_id", "") for _, camera in aligned}, file)
     components = _components(chunk, {camera.get("component_id", "") for _, camera in aligned}, file)
     outer, where = chunk.find("transform"), f"<transform> of the chunk in {file}"
-    world = torch.eye(4, dtype=torch.float64) if outer is None else _similarity(outer, where)
+    same = torch.eye(4, dtype=torch.float64)
+    world = same if outer is None else _similarity(outer, where)
     frames = []
     for name, camera in aligned:
         where = f"<transform> of camera {name!r} in {file}"
@@ -73,16 +74,15 @@ def read(path: Path, options: DataOptions) -> Capture:
         pose = world @ inner @ torch.linalg.inv(cam)
         pose[:3, :3] /= torch.linalg.det(pose[:3, :3]) ** (1 / 3)
         frames.append(Frame(name, folder / name, cam_from_pose(pose, where), *sizes[camera.get("sensor_id", "")]))
-    first = next(iter(components.values()))
-    if outer is None and all(matrix.equal(torch.eye(4, dtype=torch.float64)) for matrix in components.values()):
+    if outer is None and all(matrix.equal(same) for matrix in components.values()):
         notes.append(f"{file.name} has no <transform> of a chunk or component: lengths are in the chunk's own unit")
-    plys = [file.parent / name for name in _PLY if (file.parent / name).is_file()] or sorted(file.parent.glob("*.ply"))
+    plys = [file.parent / name for name in _PLY if (file.parent / name).is_file()] or files_with(file.parent, ".ply")
     if len(plys) > 1:
         notes.append(f"points: {plys[0].name}, not {listed(ply.name for ply in plys[1:])}; set data.points to choose")
-    same = torch.eye(4, dtype=torch.float64)
     # In which frame a cloud was exported is not stated in its file.
     readings = [("points in the frame of the chunk", world), ("points in the frame of the world", same)]
-    readings += [("points in the frame of the component", world @ first)] if len(components) == 1 else []
+    if len(components) == 1:
+        readings.append(("points in the frame of the component", world @ next(iter(components.values()))))
     return Capture(
         format="metashape",
         folder=file.parent,
@@ -168,9 +168,7 @@ def _similarity(element: XML.Element, where: str) -> Tensor:
         scale = torch.ones(()) if stated is None else _numbers(stated, 1, f"<scale> of {where}")[0]
     if not scale > 0:
         raise DataError(f"{where}: the scale is {scale.item():g}; it must be positive")
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = scale * checked_rotation(rotation, where), translation
-    return matrix
+    return rigid(scale * checked_rotation(rotation, where), translation)
 
 
 def _numbers(element: XML.Element | None, count: int, where: str) -> Tensor:

@@ -36,7 +36,7 @@ from padgs.data.formats.poses import (
     rigid,
     rotation_from_quaternion,
 )
-from padgs.data.splits import LISTS, check_name, read_lines
+from padgs.data.splits import LISTS, check_name, read_lines, read_list
 
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
@@ -54,9 +54,8 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
             frames.append(Frame(name, images / name, cam_from_pose(matrix.numbers(4, 4), matrix.where)))
             names.append(name)
         split[side] = tuple(names)
-    twice = set(split["train"]) & set(split["test"])
-    if twice:
-        raise DataError(f"{file}: {sorted(twice)[0]} is both a train and a test view; keep it in one list")
+    if twice := set(split["train"]) & set(split["test"]):
+        raise DataError(f"{file}: {min(twice)} is both a train and a test view; keep it in one list")
     known = DATASETS["roam360"]
     cloud = first_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
     return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)
@@ -105,10 +104,10 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
     images = image_folder(path, options.images)
     frames: dict[str, Frame] = {}  # by number
     for file in sorted((path / "cameras").glob("*_cam.json")):
-        (camera,) = one if len(one := read_json(file).entries()) == 1 else (None,)
-        if camera is None:
+        cameras = read_json(file).entries()
+        if len(cameras) != 1:
             raise DataError(f"{file} must hold a list of one camera; copy it again")
-        number = file.name.removesuffix("_cam.json")
+        camera, number = cameras[0], file.name.removesuffix("_cam.json")
         pose = camera["extrinsics"]
         depth = path / "depths" / f"{number}_depth.exr"
         frames[number] = Frame(
@@ -124,8 +123,7 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
     split = {}
     for side, name in LISTS.items():
         if (path / name).is_file():
-            lines = [line.strip() for line in read_lines(path / name) if line.strip()]
-            numbers = [line.removesuffix("_rgb.png").zfill(5) for line in lines]
+            numbers = [line.removesuffix("_rgb.png").zfill(5) for line in read_list(path / name)]
             if absent := [number for number in numbers if number not in frames]:
                 raise DataError(f"{path / name} names {listed(absent)}, which have no camera; copy the data set again")
             split[side] = tuple(frames[number].name for number in numbers)
@@ -143,6 +141,8 @@ def read_tartanair(path: Path, options: DataOptions) -> Capture:
     images, file = image_folder(path, options.images), path / "poses.txt"
     frames = []
     for index, line in enumerate(read_lines(file), start=1):
+        if not line.strip():
+            continue
         where = f"line {index} of {file}"
         try:
             frame, *numbers = line.split()
@@ -154,7 +154,7 @@ def read_tartanair(path: Path, options: DataOptions) -> Capture:
         body = rotation_from_quaternion(values[[6, 3, 4, 5]], where)
         pose = cam_from_pose(rigid(body @ _BODY_FROM_CAMERA, values[:3]), where)
         depth = path / "depth" / f"{name}.png"
-        image = next((images / f"{name}{end}" for end in (".jpg", ".png") if (images / f"{name}{end}").is_file()), None)
-        image = image or images / f"{name}.jpg"
+        jpeg, png = images / f"{name}.jpg", images / f"{name}.png"
+        image = png if png.is_file() and not jpeg.is_file() else jpeg
         frames.append(Frame(image.name, image, pose, depth=depth if depth.parent.is_dir() else None))
     return Capture("tartanair", path, images, tuple(frames), None, depth=DepthMeaning("ray", 1 / 8, "TartanAir-V2"))

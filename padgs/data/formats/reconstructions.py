@@ -41,17 +41,16 @@ def read_openmvg(path: Path, options: DataOptions) -> Capture:
     # must not reach other folders.
     stated = data.get("root_path")
     root = PurePosixPath(stated.text().replace("\\", "/")).name if stated else ""
-    images = image_folder(folder, options.images, ("images", "imgs", *([root] if root not in ("", "..") else [])))
+    images = image_folder(folder, options.images, ("images", "imgs", *({root} - {"", ".."})))
     posed = [view for view in views if view.pose in poses]
     frames = tuple(Frame(view.name, images / view.name, poses[view.pose], *view.size) for view in posed)
     if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply")):
         note = "points: from the PLY file beside sfm_data.json, which has colours"
         return Capture("openmvg", folder, images, frames, colored, notes=(note,))
-    stated, cloud = data.get("structure"), None
+    stated = data.get("structure")
     structure = stated.entries() if stated else []
-    if structure:
-        points = Json([item["value"]["X"].value for item in structure], f"X of the structure of {file}")
-        cloud = Cloud(points.numbers(len(structure), 3), None)
+    points = Json([item["value"]["X"].value for item in structure], f"X of the structure of {file}")
+    cloud = Cloud(points.numbers(len(structure), 3), None) if structure else None
 
     def tracks() -> Tracks:
         frame_of_view = {view.key: i for i, view in enumerate(posed)}
@@ -132,8 +131,8 @@ def _opensfm_cloud(part: Json) -> Cloud | None:
         return None
     where, colors = f"the points of {part.where}", None
     positions = Json([point["coordinates"].value for point in points], where)
-    stated = [point.get("color") for point in points]
-    if all(stated):
-        values = Json([color.value for color in stated if color], f"color of {where}").numbers(len(points), 3)
+    paint = [color.value for point in points if (color := point.get("color"))]
+    if len(paint) == len(points):
+        values = Json(paint, f"color of {where}").numbers(len(points), 3)
         colors = color_bytes(whole_if_possible(values.numpy()), where)
     return Cloud(positions.numbers(len(points), 3), colors)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from padgs.data.capture import Cloud, DataError, Frame, Tracks
+from padgs.data.capture import Cloud, DataError, Frame, Tracks, view_name
 from padgs.data.cloud import write_ply
 from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.poses import OPENCV_FROM_OPENGL
@@ -78,9 +78,9 @@ def write_transforms(content: Content, folder: Path) -> None:
 
 def write_openmvg(content: Content, folder: Path) -> None:
     """Write `sfm_data.json`, colorized.ply for the colours, and the lists."""
-    views, extrinsics = _mvg_views(content)
+    views, extrinsics, sizes = _mvg_views(content)
     intrinsics = []
-    for key, (width, height) in enumerate(_sizes(content)):
+    for key, (width, height) in enumerate(sizes):
         # As cereal writes it: only the first object of a type has its name, and pointers are numbered throughout.
         kind = {"polymorphic_id": 1} if key else {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
         data = {"value0": {"width": width, "height": height}}
@@ -96,15 +96,8 @@ def write_openmvg(content: Content, folder: Path) -> None:
     for feature, (frame, point, pixel) in enumerate(rows):
         seen = {"key": frame, "value": {"id_feat": feature, "x": pixel}}
         structure[point]["value"]["observations"].append(seen)
-    data = {
-        "sfm_data_version": "0.3",
-        "root_path": "images",
-        "views": views,
-        "intrinsics": intrinsics,
-        "extrinsics": extrinsics,
-        "structure": structure,
-        "control_points": [],
-    }
+    data = {"sfm_data_version": "0.3", "root_path": "images", "views": views, "intrinsics": intrinsics}
+    data |= {"extrinsics": extrinsics, "structure": structure, "control_points": []}
     _write_json(folder / "sfm_data.json", data)
     _write_lists(content, folder)
 
@@ -133,7 +126,7 @@ def write_opensfm(content: Content, folder: Path) -> None:
 
 def write_released(content: Content, folder: Path) -> None:
     """Write data_views.json, data_extrinsics.json, pcd.ply and the lists (without extensions)."""
-    views, extrinsics = _mvg_views(content)
+    views, extrinsics, _ = _mvg_views(content)
     _write_json(folder / "data_views.json", {"views": views})
     _write_json(folder / "data_extrinsics.json", {"extrinsics": extrinsics})
     if content.cloud is not None:
@@ -151,8 +144,9 @@ WRITERS: dict[str, Callable[[Content, Path], None]] = {
 }
 
 
-def _mvg_views(content: Content) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    views, extrinsics, sizes = [], [], _sizes(content)
+def _mvg_views(content: Content) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[tuple[int, int]]]:
+    """Return OpenMVG's views and extrinsics, and the sizes of the images, each once."""
+    views, extrinsics, sizes = [], [], [*dict.fromkeys(map(_size, content.frames))]
     for i, frame in enumerate(content.frames):
         width, height = _size(frame)
         data = {"local_path": "", "filename": frame.name, "width": width, "height": height}
@@ -162,12 +156,7 @@ def _mvg_views(content: Content) -> tuple[list[dict[str, Any]], list[dict[str, A
         rotation, translation = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]
         center = -rotation.T @ translation
         extrinsics.append({"key": i, "value": {"rotation": rotation.tolist(), "center": center.tolist()}})
-    return views, extrinsics
-
-
-def _sizes(content: Content) -> list[tuple[int, int]]:
-    """Return the sizes of the images, each once."""
-    return [*dict.fromkeys(map(_size, content.frames))]
+    return views, extrinsics, sizes
 
 
 def _size(frame: Frame) -> tuple[int, int]:
@@ -186,5 +175,5 @@ def _write_json(path: Path, value: Any) -> None:
 
 def _write_lists(content: Content, folder: Path, extensions: bool = True) -> None:
     for side, names in content.split.items():
-        lines = [name if extensions else name.rpartition(".")[0] for name in names]
+        lines = [name if extensions else view_name(name) for name in names]
         (folder / LISTS[side]).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

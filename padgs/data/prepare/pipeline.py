@@ -17,9 +17,9 @@ import torch
 from filelock import FileLock, Timeout
 from PIL import Image
 
-from padgs.data.assemble import IMAGE_FOLDERS, view_name
+from padgs.data.assemble import IMAGE_FOLDERS
 from padgs.data.camera_paths import gravity
-from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, listed
+from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, listed, view_name
 from padgs.data.formats import colmap
 from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.writers import Content, write_colmap
@@ -60,17 +60,12 @@ def prepare(
     options: PrepareOptions | None = None,
     progress: Progress = lambda step, done, total: None,
 ) -> Prepared:
-    """Compute poses and points of panoramas by structure from motion.
+    """Compute poses and points of panoramas by structure from motion. Results are reproducible on one machine.
 
-    A DataError names unusable input, panoramas without a relative pose, or a full disk. Intermediate results stay in
-    the hidden folder; nothing is written to the destination.
-
-    Args:
-        source: a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video.
-        destination: a folder that does not exist, is empty, or was written by the same call. Gets images/, sparse/0
-            (COLMAP, camera EQUIRECTANGULAR), masks if there are any, and prepare.json.
-        options: defaults if None. Results are reproducible on one machine.
-        progress: called with (step, done, total).
+    `source` is a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video. The destination does
+    not exist, is empty, or was written by the same call; it gets images/, sparse/0 (COLMAP, camera EQUIRECTANGULAR),
+    masks if there are any, and prepare.json. A DataError names unusable input, panoramas without a relative pose, or a
+    full disk; intermediate results then stay in the hidden folder, and nothing is written to the destination.
     """
     options = options or PrepareOptions()
     if result := _existing(source, destination, options):
@@ -218,10 +213,9 @@ class _Job:
         sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, progress)
 
     def _reconstruct(self) -> None:
-        parts = self.folder.empty("parts")
-        progress, seed = partial(self.progress, "poses"), self.options.seed
-        rest = self.threads, seed, self.views, progress, self.options.mapper
-        if not sfm.reconstruct(self.database, self.feature_images, parts, *rest):
+        folders = self.database, self.feature_images, self.folder.empty("parts")
+        rest = self.threads, self.options.seed, self.views, partial(self.progress, "poses"), self.options.mapper
+        if not sfm.reconstruct(*folders, *rest):
             raise DataError(f"no relative pose was found for any two of the {len(self.files)} panoramas; {_REMEDIES}")
 
     def _write(self) -> Prepared:
@@ -234,16 +228,14 @@ class _Job:
         if self.options.level:
             frames, cloud, note = level_world(frames, cloud)
             notes.append(note)
+        note = "the scale of the world is arbitrary: --metres, --camera-height and --gps set it"
         if found := to_metres(frames, cloud, self.options.known):
             change, note = found
             frames, cloud = moved(frames, cloud, change)
             write_unit(partial_folder, note)
-            notes.append(note)
-        else:
-            notes.append("the scale of the world is arbitrary: --metres, --camera-height and --gps set it")
+        notes.append(note)
         registered = tuple(frame.name for frame in frames)
-        unregistered = tuple(name for name in self.files.values() if name not in set(registered))
-        if unregistered:
+        if unregistered := tuple(name for name in self.files.values() if name not in set(registered)):
             lost = f"{len(unregistered)} of {len(self.files)} panoramas"
             notes.append(f"{lost} have no pose: {listed(unregistered)}; {_REMEDIES}")
         if others:

@@ -164,6 +164,14 @@ def test_e57_files_hold_panoramas_poses_and_points(e57: Path, world: World) -> N
         assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
 
 
+def test_suffixes_are_found_in_any_case_and_hidden_files_are_not_read(e57: Path) -> None:
+    folder = e57.with_name("upper")
+    folder.mkdir()
+    e57.rename(folder / "SCAN.E57")
+    (folder / "._SCAN.E57").write_bytes(b"written by macOS")
+    assert len(load(folder, split="all").train) == 6
+
+
 def test_pictures_of_another_export_of_an_e57_file_are_written_again(e57: Path, world: World) -> None:
     read(e57)
     (written,) = [path for path in e57.parent.rglob("*.png") if "pano_00_" in path.name]
