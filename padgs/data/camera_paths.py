@@ -40,7 +40,7 @@ def gravity(poses: Tensor) -> Gravity:
 
 def path_length(poses: Tensor) -> float:
     """Return the length of the path through the camera centres in the given order, in world units."""
-    return (centers(poses)[1:] - centers(poses)[:-1]).norm(dim=1).sum().item()
+    return centers(poses).diff(dim=0).norm(dim=1).sum().item()
 
 
 def median_depth(poses: Tensor, points: Tensor) -> float:
@@ -67,11 +67,9 @@ def interpolate_poses(poses: Tensor, times: Sequence[float] | np.ndarray) -> Ten
     """Interpolate poses [F, 4, 4] at times in [0, F - 1]: centres linearly, rotations spherically. [T, 4, 4]."""
     from scipy.spatial.transform import Rotation, Slerp
 
-    numbers = np.arange(len(poses))
-    given = poses.double().cpu().numpy()
-    centers = -np.einsum("fji,fj->fi", given[:, :3, :3], given[:, :3, 3])
-    rotations = Slerp(numbers, Rotation.from_matrix(given[:, :3, :3]))(times).as_matrix()
-    at = np.stack([np.interp(times, numbers, axis) for axis in centers.T], axis=-1)
+    numbers, poses = np.arange(len(poses)), poses.double().cpu()
+    rotations = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3].numpy()))(times).as_matrix()
+    at = np.stack([np.interp(times, numbers, axis) for axis in centers(poses).numpy().T], axis=-1)
     return _poses(rotations, at)
 
 
@@ -82,20 +80,19 @@ def along_cameras(scene: Scene, frames: int) -> Tensor:
 
     views = sorted(scene.panoramas, key=lambda view: natural_key(view.name))
     given = torch.stack([view.cam_from_world for view in views])
-    centers = torch.stack([view.center for view in views])
-    steps = (centers[1:] - centers[:-1]).norm(dim=-1).cpu().numpy()
+    steps = centers(given).diff(dim=0).norm(dim=-1).cpu().numpy()
     if len(given) < 2 or scene.has_single_center:
         raise ValueError(f"{len(given)} training cameras with one centre make no path; use --path orbit or dolly")
     distance = np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-9 * steps.max()))))
     times = np.interp(np.linspace(0, distance[-1], frames), distance, np.arange(len(distance)))
-    poses = interpolate_poses(given, times).numpy()
+    poses = interpolate_poses(given, times)
     width = SMOOTHING * frames / len(steps)
-    centers = gaussian_filter1d(-np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3]), width, 0, mode="nearest")
-    quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    at = gaussian_filter1d(centers(poses).numpy(), width, 0, mode="nearest")
+    quats = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat()
     signs = np.where((quats[1:] * quats[:-1]).sum(-1) < 0, -1.0, 1.0)  # q and -q are one turn
     quats[1:] *= np.cumprod(signs)[:, None]
     rotations = Rotation.from_quat(gaussian_filter1d(quats, width, 0, mode="nearest")).as_matrix()
-    return _poses(rotations, centers)
+    return _poses(rotations, at)
 
 
 def orbit(scene: Scene, frames: int) -> Tensor:
@@ -111,8 +108,7 @@ def orbit(scene: Scene, frames: int) -> Tensor:
 def dolly(scene: Scene, frames: int) -> Tensor:
     """Return a straight path through the mean training camera, along their widest level direction, looking ahead."""
     middle, up, forward = _frame(scene)
-    centers = torch.stack([view.center for view in scene.train]).cpu().numpy()
-    along = (centers - middle) @ forward
+    along = (torch.stack([view.center for view in scene.train]).cpu().numpy() - middle) @ forward
     single = SINGLE_CENTER_RADIUS * scene.scale
     reach = (-single, single) if scene.has_single_center else (along.min(), along.max())
     at = middle + np.linspace(*reach, frames)[:, None] * forward
@@ -134,15 +130,14 @@ def look_along(centers: np.ndarray, directions: np.ndarray, up: np.ndarray) -> T
 def _frame(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean centre of the training cameras, up, and the level direction of their widest extent."""
     poses = torch.stack([view.cam_from_world for view in scene.panoramas]).double().cpu()
-    up = np.array(gravity(poses).up)
-    centers = torch.stack([view.center for view in scene.panoramas]).double().cpu().numpy()
-    middle = centers.mean(0)
+    up, at = np.array(gravity(poses).up), centers(poses).numpy()
+    middle = at.mean(0)
     level = np.eye(3) - np.outer(up, up)
-    forward = np.linalg.svd((centers - middle) @ level)[2][0]
+    forward = np.linalg.svd((at - middle) @ level)[2][0]
     if scene.has_single_center or np.linalg.norm(level @ forward) < 1e-6:
         forward = level @ poses[0, 2, :3].numpy()
     forward = level @ forward
-    if forward @ (centers[-1] - centers[0]) < 0:
+    if forward @ (at[-1] - at[0]) < 0:
         forward = -forward
     return middle, up, forward / np.linalg.norm(forward)
 

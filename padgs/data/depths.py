@@ -20,8 +20,8 @@ from torch import Tensor
 
 from padgs.checks import install_command
 from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, listed
-from padgs.data.images import read_bytes
-from padgs.files import DAMAGE, open_image
+from padgs.data.images import read_bytes, refused_if_damaged
+from padgs.files import open_image
 from padgs.scene import View
 
 FOLDERS = ("depths", "depth")
@@ -113,7 +113,7 @@ def with_depths(
 def read_depth(file: Path) -> NDArray[np.float32]:
     """Read the numbers of a depth map, [H, W]; a DataError for a damaged or 8-bit file, or for channels that differ."""
     data = read_bytes(file)
-    try:
+    with refused_if_damaged(file):
         if file.suffix.lower() == ".npy":
             values = np.load(BytesIO(data), allow_pickle=False)
         elif file.suffix.lower() == ".exr":
@@ -123,10 +123,6 @@ def read_depth(file: Path) -> NDArray[np.float32]:
             if not image.mode.startswith("I"):
                 raise DataError(f"{file} has pixels of type {image.mode}; a depth map needs 16 bits, in one channel")
             values = np.asarray(image)
-    except DAMAGE as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{file} is cut short or damaged ({error}); copy it again or remove it") from error
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":

@@ -5,7 +5,8 @@ A panorama is an 8-bit colour image in sRGB, twice as wide as high, stored uprig
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -54,20 +55,14 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFi
     Photographs of other cameras, and their masks, have any shape (`panorama` is false).
     """
     data = read_bytes(path)
-    with _opened(data, path) as image:
-        try:
-            load_late_chunks(image, data)
-            refuse_rotated(image, path)
-            refuse_several_pictures(image, path)
-            mode, conversion = image.mode, None
-            _refuse_other_modes(image, data, path, mask)
-            crop = crop_of(image, path) if panorama else None
-            if not mask:
-                conversion = srgb_conversion(image, data, path)
-        except DAMAGE as error:
-            if isinstance(error, DataError):
-                raise
-            raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+    with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
+        load_late_chunks(image, data)
+        refuse_rotated(image, path)
+        refuse_several_pictures(image, path)
+        mode = image.mode
+        _refuse_other_modes(image, data, path, mask)
+        crop = crop_of(image, path) if panorama else None
+        conversion = None if mask else srgb_conversion(image, data, path)
         size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
         may_be_transparent = mode in _ALPHA or "transparency" in image.info
     if panorama:
@@ -78,11 +73,17 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFi
     return ImageFile(path, *size, digest, crop, conversion is not None)
 
 
-def _opened(data: bytes, path: Path) -> Image.Image:
+@contextmanager
+def refused_if_damaged(path: Path) -> Iterator[None]:
+    """Turn what decoders raise on a file into a DataError that names it."""
     try:
-        return open_image(BytesIO(data), path)
+        yield
+    except DataError:
+        raise
     except ImageError as error:
         raise DataError(str(error)) from error
+    except DAMAGE as error:
+        raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
 
 
 def _refuse_other_modes(image: Image.Image, data: bytes, path: Path, mask: bool) -> None:
@@ -134,18 +135,13 @@ def save_png(pixels: Tensor, path: Path) -> None:
 
 
 def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
-    try:
-        with _opened(data, path) as image:
-            image.load()
-            transparent = _is_transparent(image)
-            convert = srgb_conversion(image, data, path) if mode == "RGB" else None
-            crop, stored = crop_of(image, path), _eight_bit(image).convert(mode)
-            cut = _misses_pixels(image, data, np.asarray(stored))
-            pixels = np.array(stored if convert is None else convert(stored))
-    except DAMAGE as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+    with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
+        image.load()
+        transparent = _is_transparent(image)
+        convert = srgb_conversion(image, data, path) if mode == "RGB" else None
+        crop, stored = crop_of(image, path), _eight_bit(image).convert(mode)
+        cut = _misses_pixels(image, data, np.asarray(stored))
+        pixels = np.array(stored if convert is None else convert(stored))
     if cut:
         raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
     if transparent:

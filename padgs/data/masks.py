@@ -40,13 +40,12 @@ class Mask:
 
     def __call__(self) -> Tensor:
         """Return weights [H, W] float32 in [0, 1]."""
-        weight = None if self.file is None else self.file()[..., 0].float() / 255
-        if self.fixed is None:
-            assert weight is not None
-            return 1 - weight if self.inverted else weight
-        weight = 1 - weight if weight is not None and self.inverted else weight
-        fixed = self.fixed if weight is None else self.fixed.to(weight.device)
-        return fixed.expand(-1, 2 * len(fixed)).clone() if weight is None else weight * fixed
+        if self.file is None:
+            assert self.fixed is not None
+            return self.fixed.expand(-1, 2 * len(self.fixed)).clone()
+        weight = self.file()[..., 0].float() / 255
+        weight = 1 - weight if self.inverted else weight
+        return weight if self.fixed is None else weight * self.fixed.to(weight.device)
 
 
 def row_weights(keep: float, of: float, height: int) -> Tensor:

@@ -4,7 +4,7 @@ Test views keep the poses that their images were taken at.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,9 +25,7 @@ QUANTILES = (0.02, 0.98)  # of the points, between which the size of the cloud i
 @condition("the world is rotated by {}° about a tilted axis", 15, 45, 90, test_views=True, allowed=(0.2, 0.3, 0.5))
 def world_rotation(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """Rotate the world, cameras included; the images stay the same."""
-    from scipy.spatial.transform import Rotation
-
-    world = torch.from_numpy(Rotation.from_rotvec(degrees * np.array(DIAGONAL), degrees=True).as_matrix())
+    world = rotation_about(degrees * np.array(DIAGONAL))
     points = (scene.points.double() @ world.T.to(scene.points.device)).float()
 
     def move(view: View) -> View:
@@ -75,11 +73,8 @@ def pose_rotation(scene: Scene, sigma: float, random: np.random.Generator) -> Sc
     """Rotate training cameras about random axes by a normal angle with a standard deviation of `sigma` degrees."""
 
     def move(view: View) -> View:
-        from scipy.spatial.transform import Rotation
-
         axis, size = random.standard_normal(3), random.standard_normal()
-        rotation = Rotation.from_rotvec(axis / np.linalg.norm(axis) * sigma * size, degrees=True).as_matrix()
-        return rotate_camera(view, torch.from_numpy(rotation))
+        return rotate_camera(view, rotation_about(axis / np.linalg.norm(axis) * sigma * size))
 
     return change_training_views(scene, move)
 
@@ -145,6 +140,13 @@ def change_training_views(scene: Scene, change: Callable[[View], View]) -> Scene
 def change_views(scene: Scene, change: Callable[[View], View]) -> Scene:
     """Return the scene with all training views changed, and then all test views."""
     return replace(change_training_views(scene, change), test=tuple(map(change, scene.test)))
+
+
+def rotation_about(vector: Sequence[float] | np.ndarray) -> Tensor:
+    """Return the rotation [3, 3] float64 about a vector [3] by its length in degrees."""
+    from scipy.spatial.transform import Rotation
+
+    return torch.from_numpy(Rotation.from_rotvec(vector, degrees=True).as_matrix())
 
 
 def rotate_camera(view: View, rotation: Tensor) -> View:

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.perturb.condition import condition
-from padgs.data.perturb.geometry import change_training_views, change_views, rotate_camera
+from padgs.data.perturb.geometry import change_training_views, change_views, rotate_camera, rotation_about
 from padgs.files import open_image
 from padgs.geometry.panorama import pad_panorama, project, rays, sample, sample_bicubic
 from padgs.scene import Scene, View
@@ -54,16 +54,13 @@ def seam(scene: Scene, degrees: float | str, random: np.random.Generator) -> Sce
     """Turn all cameras about their vertical by whole pixels, each by a random angle if `degrees` is "random"."""
 
     def turn(view: View) -> View:
-        from scipy.spatial.transform import Rotation
-
         columns = round(view.width * (random.random() if isinstance(degrees, str) else degrees / 360))
-        angle = 360 * columns / view.width
-        rotation = Rotation.from_rotvec((0, angle, 0), degrees=True).as_matrix()
+        rotation = rotation_about((0, 360 * columns / view.width, 0))
 
         def shift(pixels: Tensor) -> Tensor:
             return pixels.roll(columns, dims=1)
 
-        return change_pixels(rotate_camera(_panorama(view), torch.from_numpy(rotation)), shift, shift, shift)
+        return change_pixels(rotate_camera(_panorama(view), rotation), shift, shift, shift)
 
     return change_views(scene, turn)
 
@@ -71,9 +68,7 @@ def seam(scene: Scene, degrees: float | str, random: np.random.Generator) -> Sce
 @condition("all cameras look down by {}°: the horizon moves to the poles", 30, 60, 90, test_views=True)
 def pitch(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """Turn all cameras down, so that the horizon moves to the poles."""
-    from scipy.spatial.transform import Rotation
-
-    rotation = torch.from_numpy(Rotation.from_rotvec((degrees, 0, 0), degrees=True).as_matrix())
+    rotation = rotation_about((degrees, 0, 0))
 
     def turn(view: View) -> View:
         old_rays = rays(view.width, view.height) @ rotation.float()  # in the old camera frame, of each new pixel
