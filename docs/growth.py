@@ -2,9 +2,10 @@
 
     OMP_NUM_THREADS=1 python docs/growth.py
 
-writes the table in docs/cluster.md and the chart docs/growth.png in some minutes on an idle machine; `--quick` prints
-small sizes and writes nothing. Gaussians lie on the walls of a cube, as large as their distance from the next, and the
-panoramas are noise; every size has a process of its own, whose memory is counted above that of the smallest size.
+writes the table in docs/notes/growth.md and the chart docs/growth.png in some minutes on an idle machine; `--quick`
+prints small sizes and writes nothing. Gaussians lie on the walls of a cube, as large as their distance from the next,
+and the panoramas are noise; every size has a process of its own, whose memory is counted above that of the smallest
+size.
 """
 
 import json
@@ -89,7 +90,7 @@ def main() -> None:
     print(table := "\n".join(lines))
     if quick:
         return
-    page = FOLDER / "cluster.md"
+    page = FOLDER / "notes" / "growth.md"
     between = re.compile(r"(<!-- growth -->\n).*(<!-- end -->)", re.DOTALL)
     page.write_text(between.sub(lambda m: f"{m[1]}{table}\n{m[2]}", page.read_text()))
     draw(rows)
