@@ -273,7 +273,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "preset": lambda result: f"{EXTERNAL}{result.external['label']}" if result.external else result.preset,
     "external": lambda result: " ".join(filter(None, map(result.external.get, ("program", "version")))) or None,
     "experiments": lambda result: result.experiments or (AD_HOC,),
-    "place": lambda result: Place(result.dataset, result.scene),
+    "place": lambda result: Place.of(result.dataset, result.scene, result.fingerprint),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],
     "cameras": lambda result: _kinds(result.cameras),

@@ -1,5 +1,7 @@
 """Numbers of the paper's Tables 1-4 (`baselines/published.csv`), and the scenes that tables are about."""
 
+from __future__ import annotations
+
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,10 +17,11 @@ SCENES = {"center_1": "center1"}  # names in the file -> names of the folders, w
 AVERAGE = "average"
 BUILT_IN = "synthetic"  # data set of the generated scenes; their names begin with it
 NEVER_SEEN, TUNED_ON = "never seen", "tuned on"
-SEEN = {  # scene -> NEVER_SEEN or TUNED_ON
-    scene: kind.replace("_", " ")
+SEEN = {  # beginning of the fingerprint of a capture, or name of a generated scene -> NEVER_SEEN or TUNED_ON
+    data: kind.replace("_", " ")
     for kind, scenes in yaml.safe_load((FILE.parent.parent / "conf" / "tuned_on.yaml").read_text("utf-8")).items()
-    for scene in scenes
+    for known in scenes.values()
+    for data in known
 }
 OUTDOOR_WORDS = ("outdoor", "garden")  # in names of scenes outside the data sets that belong to Table 2
 
@@ -49,6 +52,16 @@ class Place:
     dataset: str
     scene: str
     apart: str = ""  # condition that separates its runs from others of the scene
+    seen: str = ""  # NEVER_SEEN or TUNED_ON, or nothing where it is not known whether settings were chosen on the scene
+
+    @classmethod
+    def of(cls, dataset: str, scene: str, fingerprint: str) -> Place:
+        """Return the scene of a result.
+
+        >>> Place.of("", "room", "e7acbfd00cf5").seen, Place.of("", "room", "0123456789").seen  # a room of someone else
+        ('tuned on', '')
+        """
+        return cls(dataset, scene, seen=SEEN.get(scene if dataset == BUILT_IN else fingerprint[:10], ""))
 
     @property
     def published(self) -> bool:
@@ -80,15 +93,6 @@ class Place:
         origin = "" if self.published else "generated" if self.dataset == BUILT_IN else self.dataset
         words = ", ".join(filter(None, (origin, self.seen)))
         return f"{self.heading} ({words})" if words else self.heading
-
-    @property
-    def seen(self) -> str:
-        """Return NEVER_SEEN or TUNED_ON, or nothing where it is not known whether settings were chosen on the scene.
-
-        >>> Place("", "flat").seen, Place("", "plaza").seen, Place("", "my_house").seen
-        ('tuned on', 'never seen', '')
-        """
-        return SEEN.get(self.scene, "") if self.dataset in ("", BUILT_IN) else ""
 
     @property
     def stem(self) -> str:

@@ -1,6 +1,7 @@
 """World of a file of Gaussians: transforms that users state, and a check that the file's world is the scene's."""
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
         return Similarity()
     file = Path(text)
     try:
-        if not file.is_file():
+        if not os.path.isfile(file):  # Path.is_file refuses long texts
             numbers: Any = [float(number) for number in text.replace(",", " ").split()]
         elif file.suffix == ".npy":
             numbers = np.load(file)
@@ -47,7 +48,7 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
         else:
             numbers = file.read_text().replace(",", " ").split()
         matrix = np.asarray(numbers, np.float64).reshape(-1, 4)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, EOFError, OverflowError) as error:
         raise ValueError(
             f"--transform {text} is no file and no 12 or 16 numbers ({error}); give a 4x4 matrix that maps the file's "
             f"world to the scene's, row by row, or {IDENTITY}"

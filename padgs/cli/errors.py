@@ -73,6 +73,8 @@ def name_place(place: Path, option: str = "--to") -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno is None:  # of an image or a library, which says itself what to do
+            raise
         is_blocked = isinstance(error, FileExistsError)  # by a file where a folder must be
         reason = f"{error.filename} is not a folder" if is_blocked else error.strerror or error
         raise ValueError(f"cannot write {place}: {reason}; name another place with {option}") from error

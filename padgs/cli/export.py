@@ -53,8 +53,8 @@ def export(
         found = export_run(
             trained,
             distillation_steps=steps,
-            upright=upright or path.suffix == ".html",
-            smooth=smooth or path.suffix == ".html",
+            upright=upright or path.suffix.lower() == ".html",
+            smooth=smooth or path.suffix.lower() == ".html",
             crop=box,
             progress=lambda done: status.update(f"distillation step {done} of {steps}"),
         )

@@ -91,7 +91,7 @@ def _bars() -> Iterator[Callable[[str, int, int], None]]:
     def tell(step: str, done: int, total: int) -> None:
         task, told = tasks.get(step) or (bars.add_task(WORDS[step], total=total), -1)
         bars.update(task, completed=done, total=total)
-        tenth = 10 * done // total
+        tenth = 10 * done // max(total, 1)
         if bars.disable and tenth > told:
             print(f"{WORDS[step]} {done}/{total}", flush=True)
         tasks[step] = (task, tenth)

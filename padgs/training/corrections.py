@@ -61,7 +61,8 @@ def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
     rotation = u * flip @ vh
     a, b = centers(first), centers(second)
     spread = (b - b.mean(0)) @ rotation.mT
-    scale = (((a - a.mean(0)) * spread).sum() / spread.square().sum()).item()
+    length = spread.square().sum()  # 0 if all cameras stand in one place, which has no scale
+    scale = (((a - a.mean(0)) * spread).sum() / length).item() if length > 0 else 1.0
     similarity = Similarity(scale, rotation, a.mean(0) - scale * rotation @ b.mean(0))
     chord = (rotations - rotation).flatten(1).norm(dim=1) / (2 * 2**0.5)  # exact for small angles too
     degrees = torch.rad2deg(2 * torch.asin(chord.clamp(max=1)))

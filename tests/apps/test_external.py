@@ -161,11 +161,18 @@ def test_transforms_are_read_and_combined(tmp_path):
         ("0 0 0 0 0 0 0 0 0 0 0 0", "shears, or scales axes differently"),
         ("1 0 0 nan 0 1 0 0 0 0 1 0", "must be a rotation times a scale"),
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1", "the last one 0 0 0 1"),
+        (" ".join(["1.0000000000000000"] * 16), "the last one 0 0 0 1"),  # longer than a name of a file may be
     ],
 )
 def test_other_transforms_are_refused(text, rule):
     with pytest.raises(ValueError, match=rule):
         read_transform(text)
+
+
+def test_an_empty_file_is_no_transform(tmp_path):
+    (tmp_path / "a.npy").touch()
+    with pytest.raises(ValueError, match="is no file and no 12 or 16 numbers"):
+        read_transform(str(tmp_path / "a.npy"))
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import pytest
 from typer.testing import CliRunner
 
 from padgs.cli.commands import app
-from padgs.cli.errors import MAX_THREADS, without_traceback
+from padgs.cli.errors import MAX_THREADS, name_place, without_traceback
+from padgs.files import ImageError
 
 TOO_LARGE = str(10**40)
 NUMBERS = {
@@ -87,6 +88,11 @@ def test_errors_are_one_line(error, message, capsys):
     with pytest.raises(RuntimeError):  # `typer.Exit`
         command()
     assert capsys.readouterr().err == f"{message}\n"
+
+
+def test_a_damaged_image_is_not_blamed_on_the_place(tmp_path):
+    with pytest.raises(ImageError, match="a.png is damaged"), name_place(tmp_path):
+        raise ImageError("a.png is damaged")
 
 
 def test_output_that_nobody_reads_ends_the_command_in_silence(root):

@@ -86,8 +86,8 @@ def test_verdicts():
 
 def test_scenes_never_seen_decide_claims_of_our_own_alone_where_there_are_any():
     others = [
-        replace(run, dataset="", scene=scene, run=f"{scene}{run.run}")
-        for scene, gains in (("plaza", BETTER[0]), ("basement", BETTER[1]))
+        replace(run, dataset="", scene=scene, fingerprint=data, run=f"{scene}{run.run}")
+        for scene, data, gains in (("plaza", "da838962d5", BETTER[0]), ("basement", "76aa9660be", BETTER[1]))
         for run in (*runs(gains), *runs([0, 0], "omnigs"))
     ]
     found = evidence([*against(*WORSE), *others], source=OURS)

@@ -126,6 +126,12 @@ def test_alignment_finds_a_similarity_and_maps_poses_by_it(generator):
         torch.testing.assert_close(mapped[:3, :3] @ found(point) + mapped[:3, 3], 1.7 * before)
 
 
+def test_alignment_of_cameras_in_one_place_has_scale_1():
+    poses = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+    found, left = align(poses, poses)
+    assert found.scale == 1 and not left.distance.any()
+
+
 def test_views_in_one_place_have_no_scale_to_follow():
     views = tuple(replace(view, cam_from_world=torch.eye(4, dtype=torch.float64)) for view in VIEWS)
     with pytest.raises(ValueError, match="the 5 training cameras of scene .* stand in one place, which has no scale"):

@@ -100,7 +100,7 @@ def export_run(
         notes.append(f"the origin is at {origin} in the world of the data set, which is too far away for float32")
     start = _central_camera(scene.train, scene.scale)
     if upright:
-        up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
+        up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).up)
         rotation = Similarity.turning(up, UP)
         splats, start = transform_splats(splats, rotation), rotation(start)
         notes[notes.index(AXES)] = "units of the scene, rotated so that -y is up"

@@ -21,6 +21,7 @@ from torch import Tensor
 from padgs.data.capture import DataError
 from padgs.data.cloud import read_vertices
 from padgs.files import atomic_path, draft_of
+from padgs.methods.splats.smoothing_filter import widened
 from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
@@ -82,7 +83,8 @@ def check_suffix(path: Path) -> None:
 def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     """Read Gaussians from a file; `unit` is the scene scale, which files do not contain.
 
-    A DataError says that a PLY holds no Gaussians, a ValueError that the converter is not installed or fails.
+    Scales include the 3D filter that Mip-Splatting stores beside them. A DataError says that a PLY holds no Gaussians, a
+    ValueError that the converter is not installed or fails.
     """
     if path.name.lower().endswith(CONVERTED):
         check_suffix(path)
@@ -98,7 +100,9 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
         raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
-        raise DataError(f"{path} has {rest} properties f_rest_*; spherical harmonics have 0, 9, 24 or 45 of them")
+        raise DataError(
+            f"{path} has {rest} properties f_rest_*; degrees 0 to 3 have 0, 9, 24 or 45: export one of these"
+        )
 
     def columns(*wanted: str) -> torch.Tensor:  # [N, len(wanted)]
         return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))
@@ -107,10 +111,12 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     splats = Splats(empty, empty, empty, degree=degree, scene_scale=unit)
     count = len(vertex["x"])
     sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
+    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    quats[~quats.any(1), 0] = 1  # no rotation
     splats.load(
         {
             "means": columns("x", "y", "z"),
-            "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            "quats": quats,
             "log_scales": columns("scale_0", "scale_1", "scale_2"),
             "opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT),
             "sh_dc": columns("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -118,7 +124,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
         }
     )
     splats.active_degree = degree
-    return splats
+    return widened(splats, columns("filter_3D")[:, 0].square()) if "filter_3D" in names else splats
 
 
 def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:

@@ -26,7 +26,7 @@ class CropControls:
     def __init__(self, client: Any, box: Box, model: Path, can_crop: bool, redraw: Callable[[object], None]) -> None:
         """Add the controls; `box` is the initial one, `model` a run or a file, which commands name."""
         self._client, self._model, self._redraw, self._shown = client, model, redraw, False
-        size = float(np.ptp(box, axis=0).max())
+        size = float(np.ptp(box, axis=0).max()) or 1.0  # of a single Gaussian
         step = size / 200
         with client.gui.add_folder("crop", expand_by_default=False):
             self.is_on = client.gui.add_checkbox("crop", initial_value=False, disabled=not can_crop)

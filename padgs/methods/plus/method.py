@@ -134,5 +134,5 @@ class PlusMethod(SplatMethod):
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         """See `Method.build_trainer`."""
-        share = self.options.coarse_share
+        share = self.options.coarse_share if len(scene.train) > 1 else 0.0  # a rehearsal has one view, of usual size
         return Trainer(model, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)

@@ -1,9 +1,12 @@
 import json
+import math
 import shutil
 
+import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
+from numpy.lib import recfunctions as rfn
+from plyfile import PlyData, PlyElement
 from support.splat_cases import random_splats
 
 from padgs.apps.export import splat_file
@@ -43,6 +46,23 @@ def test_the_header_suits_the_viewer_of_3dgs(tmp_path, generator):
     assert header[2:4] == [f"element vertex {len(splats)}", r"comment run flat \xe9"]
     first = [line.split()[-1] for line in header[4:13]]
     assert first == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+
+
+def test_a_stored_filter_widens_and_a_zero_quaternion_turns_nothing(tmp_path, generator):
+    """Mip-Splatting keeps its 3D filter beside the scales: 0.4 and 0.3 make 0.5, and opacity falls by (0.4 / 0.5)^3."""
+    splats = random_splats(0, generator)
+    with torch.no_grad():
+        splats.log_scales.fill_(math.log(0.4))
+        splats.quats[2] = 0.0
+    write_splats(tmp_path / "a.ply", splats)
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    found = rfn.append_fields(vertex, "filter_3D", np.full(len(splats), 0.3, np.float32), usemask=False)
+    PlyData([PlyElement.describe(found, "vertex")], byte_order=">").write(str(tmp_path / "big_endian.ply"))
+    found = read_splats(tmp_path / "big_endian.ply")
+    torch.testing.assert_close(found.log_scales.exp(), torch.full((len(splats), 3), 0.5))
+    opacities = torch.sigmoid(splats.opacity_logits) * 0.8**3
+    torch.testing.assert_close(torch.sigmoid(found.opacity_logits), opacities)
+    assert found.quats[2].tolist() == [1, 0, 0, 0]
 
 
 def test_invalid_files_are_refused(tmp_path, generator):
