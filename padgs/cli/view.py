@@ -34,19 +34,17 @@ def view(
 
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.external import is_splat_file, open_model
-        from padgs.runs.load import load_run
 
-        runs, names = [], []
-        place = data or next((folder for folder in folders if not is_splat_file(folder)), None)
+        runs: list[LoadedRun] = []
+        files = [folder for folder in folders if is_splat_file(folder)]
+        place = data or next((folder for folder in folders if folder not in files), None)
         for folder in folders:
             wait_for_checkpoint(folder)
-            is_file = is_splat_file(folder)
-            found = open_model(folder, place, rays, transform) if is_file else load_run(folder, data_path=data)
-            for note in getattr(found, "notes", ()):
+            stated = (rays, transform) if folder in files or not files else ()  # a run beside a file has its own
+            runs.append(open_model(folder, place if folder in files else data, *stated))
+            for note in getattr(runs[-1], "notes", ()):
                 show(f"  {note}")
-            runs.append(found)
-            names.append(found.scene.name)
-        if len({*names}) > 1:
+        if len(names := [*dict.fromkeys(found.scene.name for found in runs)]) > 1:
             scenes = " and ".join(names)
             raise ValueError(f"{run} and {beside} are of two scenes, {scenes}; name two runs of one scene")
         return runs

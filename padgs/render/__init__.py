@@ -107,14 +107,12 @@ def resolve_backend(backend: str, means: Tensor) -> str:
     """Return the backend that `auto` selects for these tensors; other names are returned unchanged."""
     if backend != "auto":
         return backend
-    from padgs.native import LIBRARIES
+    from padgs.native import LIBRARIES, library_for
 
-    library = LIBRARIES.get(means.device.type)
-    if library is None or means.dtype != torch.float32:
-        return "torch"
-    if library.works_on(means.device):
+    if library_for(means) is not None:
         return means.device.type
-    _warn_missing_library(means.device)
+    if means.device.type in LIBRARIES and means.dtype == torch.float32:
+        _warn_missing_library(means.device)
     return "torch"
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.distortion import end_row_weight, solid_angle_weight
-from padgs.native import LIBRARIES, cpu, cuda
+from padgs.native import cpu, cuda, library_for
 from padgs.native.abi import LossArguments, pointer
 
 WINDOW, SIGMA = 11, 1.5  # SSIM window in pixels
@@ -55,7 +55,7 @@ def photometric_loss(
         image = torch.where(visible, image, filling)
         target = torch.where(visible, target, filling) if target.requires_grad else target
     total = weight.sum() * (height * width // weight.numel() * (channels if normalisation == "mean" else 1))
-    if fits(image):
+    if channels == 3 and library_for(image) is not None:
         loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, total)
         if target.requires_grad:  # Eq. 16 is symmetric: exchange both to differentiate by the target
             mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, total)
@@ -146,14 +146,6 @@ def _blur(images: Tensor, dim: int) -> Tensor:
         result.narrow(dim, 0, size - step).add_(images.narrow(dim, step, size - step), alpha=taps[half + step])
         result.narrow(dim, step, size - step).add_(images.narrow(dim, 0, size - step), alpha=taps[half - step])
     return result
-
-
-def fits(image: Tensor) -> bool:
-    """Return whether a native loss takes an image: float32, three channels, and a library for its device."""
-    library = LIBRARIES.get(image.device.type)
-    if library is None or image.dtype != torch.float32 or image.shape[-1] != 3:
-        return False
-    return library.works_on(image.device)
 
 
 def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:

@@ -83,8 +83,8 @@ def check_suffix(path: Path) -> None:
 def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     """Read Gaussians from a file; `unit` is the scene scale, which files do not contain.
 
-    Scales include the 3D filter that Mip-Splatting stores beside them. A DataError says that a PLY holds no Gaussians, a
-    ValueError that the converter is not installed or fails.
+    Scales include the 3D filter of Mip-Splatting files. A DataError says that a PLY holds no Gaussians, a ValueError
+    that the converter is not installed or fails.
     """
     if path.name.lower().endswith(CONVERTED):
         check_suffix(path)

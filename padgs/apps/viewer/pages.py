@@ -20,6 +20,7 @@ from padgs.apps.viewer.controls import CropControls, FilmControls
 from padgs.apps.viewer.renders import CAMERAS, LAYERS, Box, RunRenderer, ViewOptions
 from padgs.apps.viewer.server import Server
 from padgs.data.camera_paths import gravity
+from padgs.gaussians import rotation_matrices
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
@@ -144,7 +145,7 @@ class Page:
         numbers = np.concatenate((camera.wxyz, camera.position, *(crop or ())))
         if not np.all(np.abs(numbers) < MAX_NUMBER) or not np.linalg.norm(camera.wxyz) > 1 / MAX_NUMBER:  # also NaN
             raise ValueError(f"camera and crop need a rotation and numbers below {MAX_NUMBER:g}; reload the page")
-        world_from_cam = matrix_of(camera.wxyz)
+        world_from_cam = rotation_matrices(torch.as_tensor(camera.wxyz)).numpy()
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width, height = sides(int(self._width.value), camera.aspect)
@@ -235,13 +236,6 @@ def wxyz_of(matrix: np.ndarray) -> np.ndarray:
     from viser.transforms import SO3
 
     return SO3.from_matrix(matrix).wxyz
-
-
-def matrix_of(wxyz: np.ndarray) -> np.ndarray:
-    """Return the rotation [3, 3] of a quaternion [4]."""
-    from viser.transforms import SO3
-
-    return SO3(wxyz).as_matrix()
 
 
 def sides(longer: int, aspect: float) -> tuple[int, int]:

@@ -17,7 +17,6 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
@@ -67,7 +66,11 @@ def serve(
 @contextmanager
 def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
     """Serve empty pages until the context ends, at the first free port from `port`; `LOCAL`: this machine only."""
-    viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
+    try:
+        import viser
+    except ImportError as error:
+        raise ValueError(f"the viewer needs viser: {install_command('view')}") from error
+    token, local = secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
     port = free_port(host, port)
     with redirect_stdout(None), guard(token, is_local=local) as guarded:  # viser prints addresses even if not verbose
         server = viser.ViserServer(host=host, port=port, label="padgs", verbose=False)
@@ -164,15 +167,6 @@ def network_address() -> str:
         except OSError:
             return "localhost"
         return probe.getsockname()[0]
-
-
-def viser_module() -> ModuleType:
-    """Import viser; a ValueError says how to install it."""
-    try:
-        import viser
-    except ImportError as error:
-        raise ValueError(f"the viewer needs viser: {install_command('view')}") from error
-    return viser
 
 
 def has_screen() -> bool:

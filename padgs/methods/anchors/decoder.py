@@ -5,7 +5,6 @@
 """
 
 import math
-from types import ModuleType
 from typing import NamedTuple
 
 import torch
@@ -19,7 +18,7 @@ from padgs.methods.anchors.native_decoder import (
     decode_on_cpu,
     decode_on_gpu,
 )
-from padgs.native import LIBRARIES, cpu
+from padgs.native import cpu, library_for
 
 
 class Head(NamedTuple):
@@ -67,7 +66,7 @@ def decode_gaussians(
         N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient;
         with a capacity N, [1] int64, else None.
     """
-    library = _library_for(anchors)
+    library = library_for(anchors.features)
     if library is None:
         return *define_gaussians(weights, anchors), None
     flat = tuple(tensor for head in weights for tensor in head)
@@ -77,14 +76,6 @@ def decode_gaussians(
     capacity = None if capacity is None else min(capacity, anchors.offsets[..., 0].numel())
     *values, slots, raw, count = decode_on_gpu(flat, *anchors, capacity=capacity)
     return Gaussians(*values), slots, raw, None if capacity is None else count
-
-
-def _library_for(anchors: SeenAnchors) -> ModuleType | None:
-    """Return the library that decodes these tensors; None: torch."""
-    library = LIBRARIES.get(anchors.features.device.type)
-    if library is None or anchors.features.dtype != torch.float32:
-        return None
-    return library if library.works_on(anchors.features.device) else None
 
 
 def define_gaussians(weights: DecoderWeights, anchors: SeenAnchors) -> tuple[Gaussians, Tensor, Tensor]:

@@ -246,7 +246,7 @@ class EgoNeRF(nn.Module):
         rays, samples = weights.shape
         counts = (weights.detach().reshape(-1) >= self.options.min_weight).nonzero().squeeze(-1)
         ray = counts // samples
-        at = at.where(counts)
+        at = GridPosition(*(values[counts] for values in at))
         color = self.shader(products(self.appearance.factors(), at), at.chart, directions[ray])
         return color.new_zeros(rays, 3).index_add(0, ray, color * weights.reshape(-1)[counts, None])
 

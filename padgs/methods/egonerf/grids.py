@@ -85,10 +85,6 @@ class GridPosition(NamedTuple):
     polar: Tensor  # [N]
     azimuth: Tensor  # [N]
 
-    def where(self, keep: Tensor) -> GridPosition:
-        """Return the positions that an index or mask selects."""
-        return GridPosition(*(values[keep] for values in self))
-
 
 class Factors(NamedTuple):
     """Planes and lines of the three modes."""

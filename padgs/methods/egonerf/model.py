@@ -81,13 +81,11 @@ class EgoNeRFModel:
         values = {"unit": field.unit, "travel": field.travel, "kind": field.kind, "centre": field.centre.tolist()}
         return State(dict(field.state_dict()), values)
 
-    def load_state(self, state: State) -> None:
-        """Load the parameters of a model of the same size and frame."""
-        self.load_model(state)
-
     def load_model(self, state: State) -> None:
-        """Load the parameters; there is no further state."""
+        """Load the parameters of a model of the same size and frame; there is no further state."""
         self.field.load_state_dict(state.tensors)
+
+    load_state = load_model
 
     def _decaying(self, rate: float) -> LogLinear:
         """Return an exponential decay from `rate` over the run."""
@@ -156,11 +154,7 @@ class Rays:
 
 
 class RayPixels:
-    """All unmasked pixels of some views; 7 bytes per pixel, 11 if weights differ.
-
-    Attributes:
-        generator: all random choices of an iteration.
-    """
+    """All unmasked pixels of some views; 7 bytes per pixel, 11 if weights differ. `generator` makes random choices."""
 
     def __init__(
         self, views: Sequence[View], weight: str = "uniform", device: torch.device | str = "cpu", seed: int = 0

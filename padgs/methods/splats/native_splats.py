@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from padgs.geometry.harmonics import MAX_DEGREE
-from padgs.native import LIBRARIES, cpu, cuda
+from padgs.native import cpu, cuda, library_for
 from padgs.native.abi import SplatArguments, pointer
 
 MAX_COEFFICIENTS = (MAX_DEGREE + 1) ** 2 - 1  # of degrees >= 1, per colour channel
@@ -43,8 +43,7 @@ class Evaluated(NamedTuple):
 
 def native_call(means: Tensor, center: Tensor) -> Call | None:
     """Return the library's call for float32 tensors of a device; None if torch must do it, as cameras learn."""
-    library = LIBRARIES.get(means.device.type)
-    if library is None or means.dtype != torch.float32 or center.requires_grad or not library.works_on(means.device):
+    if center.requires_grad or (library := library_for(means)) is None:
         return None
     return call_cuda if library is cuda else call_cpu
 

@@ -6,6 +6,7 @@ from support import cuda_engine
 from support.splat_cases import assert_matches_definition, evaluated, splats_of
 
 from padgs.methods.splats import native_splats
+from padgs.native import LIBRARIES
 from padgs.scene import View
 
 pytestmark = [*cuda_engine.marks()]
@@ -32,7 +33,7 @@ def test_nan_stays_nan(monkeypatch: pytest.MonkeyPatch, generator: torch.Generat
 
 
 def test_supported_inputs(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(native_splats.LIBRARIES, DEVICE, native_splats.cuda)
+    monkeypatch.setitem(LIBRARIES, DEVICE, native_splats.cuda)
     means, center = torch.zeros(2, 3, device=DEVICE), torch.zeros(3, device=DEVICE)
     assert native_splats.native_call(means, center) is native_splats.call_cuda
     assert native_splats.native_call(means.double(), center) is None
