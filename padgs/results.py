@@ -167,12 +167,12 @@ def log_lines(run_folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def file_name(text: str) -> str:
-    """Return a text as a file name without separators.
+    """Return a text as a file name without separators; letters of all languages stay, since names may differ in them.
 
-    >>> file_name("left/R001 a"), file_name("chart_../../etc")
-    ('left-R001-a', 'chart_..-..-etc')
+    >>> file_name("left/R001 a"), file_name("chart_../../etc"), file_name("客厅 1")
+    ('left-R001-a', 'chart_..-..-etc', '客厅-1')
     """
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", text)
+    return re.sub(r"[^\w.-]+", "-", text)
 
 
 def picture_name(view: str) -> str:

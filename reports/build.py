@@ -8,41 +8,19 @@ from typing import Any
 
 from pandas import DataFrame
 
-from padgs.reports import REPORTS, methods, published
+from padgs.reports import REPORTS, frame, methods, published
 from padgs.reports.conditions import Reason, as_published, footnotes, refuse_mixture, unranked, unranked_notes
-from padgs.reports.frame import (
-    LARGEST_FACTOR,
-    LINEAR,
-    LINEAR_ITERATIONS,
-    PUBLISHED_ITERATIONS,
-    by_conditions,
-    by_place,
-    grouped,
-    law,
-    without_data,
-)
+from padgs.reports.frame import by_conditions, by_place, grouped, law, without_data
 from padgs.reports.measures import Measure, quantity
 from padgs.reports.published import AVERAGE, Place, Published
 from padgs.reports.selection import Mixture, RunSet, experiment_of, one_setting, refuse_differences, settings
-from padgs.reports.significance import (
-    SEEDS,
-    mean_cell,
-    numbers_of,
-    over_scenes,
-    over_seeds,
-    places,
-    unrank,
-)
+from padgs.reports.significance import SEEDS, mean_cell, numbers_of, over_scenes, over_seeds, places, unrank
 from padgs.reports.specs import PREPARE, SPECS, TITLES
 from padgs.reports.table import Block, Cell, Column, Row, Table
 
 PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers add
-IF_KNOWN = (
-    "cpu_seconds",
-    "peak_gpu_gigabytes",
-    "sphere/abs_rel",
-    "sphere/delta_1_25",
-)  # no column if no run has a number
+# No column if no run has a number
+IF_KNOWN = ("cpu_seconds", "peak_gpu_gigabytes", "sphere/abs_rel", "sphere/delta_1_25")
 SEEN_NOTE = "Tuned on: settings of methods were chosen on the scene; never seen: nobody had trained on it then."
 RATES = {"published": "published rates", "run": "rates for the run"}
 
@@ -66,16 +44,13 @@ class _Builder:
         measures = self.spec.measures(self.request.protocol)
         if self.request.metrics and not self.spec.pivot:
             own = {measure.name.rpartition("/")[2]: measure for measure in measures}
-            chosen = (own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics)
-            measures = list(chosen)
+            measures = [own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics]
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
         self.unranked: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
 
     def build(self) -> Table:
-        blocks: list[Block] = []
-        single: list[Block] = []
-        notes: list[str] = []
+        blocks, single, notes = list[Block](), list[Block](), list[str]()
         there = list(by_place(self.runs))
         for title, place, runs in self._groups():
             refuse_mixture(runs, self.request, title, self.spec.shared)
@@ -91,12 +66,12 @@ class _Builder:
                     notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(missing)}.")
                 if self.spec.scenes_down:
                     blocks += self._scenes_down(dataset, done)
-        for values, runs in self._alike() if self.spec.averages else ():
+        for values, runs in grouped(self.runs, *self.spec.blocks) if self.spec.averages else ():
             others = [place for place in by_place(runs) if not place.apart and place.dataset not in self.spec.paper]
             for kind in dict.fromkeys(place.seen for place in others):
-                alike = [place for place in others if place.seen == kind]
+                own = [place for place in others if place.seen == kind]
                 try:
-                    blocks += self._average("", alike, len(alike), runs, values)
+                    blocks += self._average("", own, len(own), runs, values)
                 except Mixture as mixture:  # each scene has a block of its own all the same
                     notes.append(f"No mean over the scenes{f' {kind}' if kind else ''}: {mixture.what}.")
         notes += footnotes(self.shown, *self.protocols)
@@ -115,18 +90,12 @@ class _Builder:
             return run_set.requested
         runs = run_set.chosen(self.name) if spec.fallback else run_set.of_experiments(*REPORTS[self.name].experiments)
         if spec.rows == "variant":
-            runs = runs.loc[
-                runs["variant"].isin([variant for titles in TITLES[spec.titles].values() for variant in titles])
-            ]
+            runs = runs.loc[runs["variant"].isin([name for titles in TITLES[spec.titles].values() for name in titles])]
         elif spec.rows != "setting":  # rows of an ablation and runs that were stopped by hand are not methods
             runs = runs.loc[runs["variant"] == ""]
         if spec.outdoor is not None:
             runs = runs.loc[[place.outdoor is spec.outdoor for place in runs["place"]]]
         return PREPARE[spec.prepare](runs)
-
-    def _alike(self) -> list[tuple[tuple[str, ...], DataFrame]]:
-        """Return values of the columns of `Spec.blocks`, and the runs of all scenes that share them."""
-        return grouped(self.runs, *self.spec.blocks) if self.spec.blocks else [((), self.runs)]
 
     def _groups(self) -> Iterator[tuple[str, Place, DataFrame]]:
         """Yield title, scene and runs of each block."""
@@ -266,10 +235,8 @@ class _Builder:
 
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
         """Return a row for each setting, the best first, those without a number last."""
-        found = [
-            (one.title, over_seeds(one_setting(one.runs, f"{where}, {one.title}"), self.measures))
-            for one in settings(runs)
-        ]
+        every = [(one.title, one_setting(one.runs, f"{where}, {one.title}")) for one in settings(runs)]
+        found = [(title, over_seeds(own, self.measures)) for title, own in every]
         found.sort(key=lambda row: (row[1][0].value is None, -(row[1][0].value or 0.0)))
         cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
         separable = all(cell.count >= SEEDS for cell in cells.values())
@@ -294,8 +261,7 @@ class _Pivot(_Builder):
         keys = sorted({*self.runs[list(spec.pivot)].itertuples(index=False, name=None)})
         headings = [", ".join([f"{key[-1]} iterations", *(RATES[rates] for rates in key[:-1])]) for key in keys]
         columns = tuple(Column(heading, 2, measure.column.higher_is_better) for heading in headings)
-        blocks: list[Block] = []
-        notes: list[str] = []
+        blocks, notes = list[Block](), list[str]()
         for title, _, runs in self._groups():
             refuse_mixture(runs, self.request, title, spec.shared)
             self.shown[title] = runs
@@ -304,10 +270,10 @@ class _Pivot(_Builder):
         if [*spec.pivot] == ["iterations"]:
             factors = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
             notes.append(
-                f"The law, √({PUBLISHED_ITERATIONS} / iterations) and at most {LARGEST_FACTOR:g}, gives {factors} "
-                f"iterations; for {', '.join(map(methods.name, LINEAR))} it is {LINEAR_ITERATIONS} / iterations. Its "
-                "loss is the difference, seed by seed, of the factor nearest to it (by their ratio) "
-                "from the one with the best mean."
+                f"The law, √({frame.PUBLISHED_ITERATIONS} / iterations) and at most {frame.LARGEST_FACTOR:g}, gives "
+                f"{factors} iterations; for {', '.join(map(methods.name, frame.LINEAR))} it is "
+                f"{frame.LINEAR_ITERATIONS} / iterations. Its loss is the difference, seed by seed, of the factor "
+                "nearest to it (by their ratio) from the one with the best mean."
             )
         notes = [*footnotes(self.shown, *self.protocols), *notes, *spec.notes]
         return Table(self.name, spec.title, spec.corner, columns, tuple(blocks), tuple(notes))
@@ -345,10 +311,8 @@ class _Pivot(_Builder):
 
     def _lengths(self, title: str, runs: DataFrame, keys: Mapping[Any, Column]) -> list[Block]:
         cells = self._cells(runs, title, "preset", *self.spec.pivot)
-        rows = (
-            Row(methods.title(preset), tuple(cells[preset].get(key, (Cell(),))[0] for key in keys))
-            for preset in methods.ordered(cells)
-        )
+        titles = {preset: methods.title(preset) for preset in methods.ordered(cells)}
+        rows = (Row(words, tuple(cells[of].get(key, (Cell(),))[0] for key in keys)) for of, words in titles.items())
         return [Block(title, tuple(rows))]
 
 
@@ -363,6 +327,4 @@ def _published(number: Published | None) -> Cell:
 
 
 def _difference(ours: Cell, theirs: Cell) -> Cell:
-    if ours.value is None or theirs.value is None:
-        return Cell()
-    return Cell(ours.value - theirs.value)
+    return Cell() if ours.value is None or theirs.value is None else Cell(ours.value - theirs.value)

@@ -90,9 +90,9 @@ class Claim:
 
     def show(self, advantage: float) -> str:
         """Return an advantage as text."""
-        return (
-            f"× {math.exp(advantage):.2f}" if self.metric in COSTS else f"{advantage:+.{self.measure.column.decimals}f}"
-        )
+        if self.metric in COSTS:
+            return f"× {math.exp(advantage):.2f}"
+        return f"{advantage:+.{self.measure.column.decimals}f}"
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,7 @@ class Evidence:
     @property
     def interval(self) -> tuple[float, float] | None:
         """Interval of the mean advantage over the tested scenes; None for fewer than two."""
-        if len(self.tested) < 2:
-            return None
-        return paired_test([*self.tested["advantage"]])[1:]
+        return None if len(self.tested) < 2 else paired_test([*self.tested["advantage"]])[1:]
 
 
 def load() -> list[Claim]:
@@ -158,18 +156,12 @@ def _verdict(evidence: Evidence) -> str:
 def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:
     """Return scene -> advantage over the best of the others in the paper's numbers."""
     name, found = claim.published_metric, {}
+    known = {key: number.value for key, number in numbers.items() if number.value is not None}
     higher = name == "fps" or (name != "train_hours" and higher_is_better(name))
     best = max if higher else min
     for table, dataset, scene in claim.published:
-        ours, others = (
-            [
-                number.value
-                for method in side.published
-                if (number := numbers.get(Key(table, DATASETS[dataset], scene, method, name)))
-                and number.value is not None
-            ]
-            for side in claim.sides
-        )
+        keys = ([Key(table, DATASETS[dataset], scene, of, name) for of in side.published] for side in claim.sides)
+        ours, others = ([known[key] for key in side if key in known] for side in keys)
         if ours and others:
             found[Place(dataset, scene).heading] = claim.advantage(best(ours), best(others), higher)
     return found
@@ -219,9 +211,8 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         refuse_mixture(alike, run_set.request, where, ("protocol",))
         if row := _beside_best(claim, one_setting(ours.select(alike), where), others.select(alike)):
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
-            row |= {"scene": found["place"].label, "seen": found["place"].seen}
-            row |= {"size": size, "length": length, "width": int(size.partition("x")[0])}
-            row["iterations"] = alike["iterations"].max()
+            row |= {"scene": found["place"].label, "seen": found["place"].seen, "size": size, "length": length}
+            row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)
             key = tuple(found[name] for name in ("place", *claim.within))
             rank = itemgetter("tested", "width", "iterations")
@@ -246,10 +237,10 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, 
     if not rivals or not len(first):
         return None
     advantages = {title: claim.advantage(first.mean(), of.mean(), higher) for title, of in rivals.items()}
-    rival = min(advantages, key=lambda title: advantages[title])
+    rival, advantage = min(advantages.items(), key=itemgetter(1))
     seeds = len(first), len(rivals[rival])
-    counts = {"tested": min(seeds) >= LEAST_SEEDS, "seeds": f"{seeds[0]}, {seeds[1]}"}
-    return {"rival": rival, "advantage": advantages[rival], **counts}
+    tested = min(seeds) >= LEAST_SEEDS and math.isfinite(advantage)  # inf: an exact render
+    return {"rival": rival, "advantage": advantage, "tested": tested, "seeds": f"{seeds[0]}, {seeds[1]}"}
 
 
 def _numbers(claim: Claim, runs: DataFrame) -> Any:

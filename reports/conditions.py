@@ -52,12 +52,10 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
     for what in () if request.mix else conditions:
         values = _values(runs, what, request.protocol).drop_duplicates()
         if len(values) > 1:
-            examples = "; ".join(
-                f"{value} in {run}" for value, run in zip(values, runs["run"][values.index], strict=True)
-            )
-            column = _column(what, request.protocol)
-            difference = f"{where}: results differ in {what} ({examples})"
-            raise Mixture(difference, "choose with --where, or compare them anyway with --mix", runs, [column])
+            named = zip(values, runs["run"][values.index], strict=True)
+            difference = f"{where}: results differ in {what} ({'; '.join(f'{value} in {run}' for value, run in named)})"
+            advice = "choose with --where, or compare them anyway with --mix"
+            raise Mixture(difference, advice, runs, [_column(what, request.protocol)])
 
 
 def sheets(
@@ -101,16 +99,15 @@ def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
 def _sentence(runs: DataFrame, protocols: Iterable[str]) -> str:
     if runs.empty:
         return "not run."
-    others = (*OF_A_DATA_SET[1:], "seed", "code_version", "hardware")
     columns = [_values(runs, "protocol", protocol) for protocol in protocols]
-    columns += [runs[what].dropna().sort_values() if what == "seed" else runs[what].dropna() for what in others]
-    *rules, sizes, lengths, rates, seeds, versions, machines = (
-        " / ".join(map(str, values.unique())) or "none" for values in columns
-    )
-    made = f"learning rates {rates}, seeds {seeds}, padgs {versions}, {machines}."
+    columns += [runs[what].dropna() for what in (*OF_A_DATA_SET[1:], "code_version", "hardware")]
+    columns.append(runs["seed"].sort_values())
+    words = (" / ".join(map(str, values.unique())) or "none" for values in columns)
+    *rules, sizes, lengths, rates, versions, machines, seeds = words
     tested = " / ".join(runs["cameras"].dropna().unique())
     views = f" test views: {tested}," if tested else ""  # all others are panoramas
-    return f"protocol {'; '.join(rules)}, {sizes},{views} {lengths}, {made}"
+    made = f"{sizes},{views} {lengths}, learning rates {rates}, seeds {seeds}, padgs {versions}, {machines}."
+    return f"protocol {'; '.join(rules)}, {made}"
 
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:

@@ -48,24 +48,20 @@ def frame(runs: Iterable[Run]) -> DataFrame:
 
 def row_of(run: Run) -> tuple[dict[str, Any], ...]:
     """Return the facts, rules, metrics, numbers and configuration of a run; any exception if it has other values."""
-    result = _cleaned(run.result)
+    result = _one_line(run.result)
     numbers = {name: None if (value := of(result)) is None else float(value) for name, of in NUMBERS.items()}
     facts = {name: of(result) for name, of in FACTS.items()}
     metrics = {f"{name}/{metric}": value for name, of in result.scores.items() for metric, value in of.metrics.items()}
     return facts, dict(_rules(result)), metrics, numbers, dict(flat(result.config))
 
 
-def _cleaned(result: Result) -> Result:
-    """Return a result whose texts are one line without control characters, as every report shows them."""
-    names = ("run", "variant", "scene", "code_version", "machine", "config", "finished", "external", "cameras")
-    scores = {
-        name: replace(of, protocol=_one_line(of.protocol), metrics=_one_line(of.metrics))
-        for name, of in result.scores.items()
-    }
-    return replace(result, scores=scores, **{name: _one_line(getattr(result, name)) for name in names})
-
-
 def _one_line(value: Any) -> Any:
+    """Return a result or a part of it; its texts become lines without control characters, as every report shows them.
+
+    Names of views stay as they are, since files are called after them.
+    """
+    if isinstance(value, (Result, Scores)):
+        return replace(value, **{name: _one_line(own) for name, own in vars(value).items() if name != "views"})
     if isinstance(value, Mapping):
         return {_one_line(key): _one_line(own) for key, own in value.items()}
     if isinstance(value, list):
@@ -79,8 +75,8 @@ def grouped(runs: DataFrame, *columns: str) -> list[tuple[tuple[Any, ...], DataF
     Runs with a missing value are left out. Three times as fast as `DataFrame.groupby` on the small frames of a table.
     """
     rows: dict[tuple[Any, ...], list[int]] = {}
-    for number, values in enumerate(zip(*(runs[column] for column in columns), strict=True)):
-        rows.setdefault(values, []).append(number)
+    for number, *values in zip(range(len(runs)), *(runs[column] for column in columns), strict=True):
+        rows.setdefault(tuple(values), []).append(number)
     known = (values for values in rows if all(value is not None and value == value for value in values))  # nor NaN
     return [(values, runs.take(rows[values])) for values in known]
 

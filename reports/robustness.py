@@ -9,7 +9,7 @@ import ast
 import math
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.resources import files
 from typing import Any
 
@@ -30,15 +30,14 @@ PROTOCOL = "stability"
 QUALITY, ONE_COLOR = f"{PROTOCOL}/ws_psnr", f"{PROTOCOL}/ws_psnr_one_color"
 EQUATOR, POLE = f"{PROTOCOL}/ws_psnr_equator", f"{PROTOCOL}/ws_psnr_pole"
 SHARED = ("resolution", "learning_rates", "data", "machine")
+SCORES = ("stability_score", "worst_quartile", "failure_rate")  # of a `StressedMethod`
 NOT_SCORED = {"textureless"}  # shown but not scored, because the scene becomes easier
 HALF = 0.5  # a condition breaks a method below this robustness
 LIMITS_ARE_FOR = ("256x128", 1500)  # resolution, and iterations without stress
 BEYOND = "beyond"
 UNITS = {"seam": "seam", "depth_error": "depth error", "ws_psnr_fitted": "dB after a fit of colours", "ws_psnr": "dB"}
-STATUS_LETTERS = {
-    **{"oom": "M", "timeout": "T", "nan": "N", "diverged": "V", "collapsed": "C"},
-    **{"exploded": "E", "degenerate": "D", "rejected": "R"},
-}
+STATUS_LETTERS = {"oom": "M", "timeout": "T", "nan": "N", "diverged": "V", "collapsed": "C"}
+STATUS_LETTERS |= {"exploded": "E", "degenerate": "D", "rejected": "R"}
 COLORS = "cividis"  # dark where nothing is left; readable for colour-blind readers
 LIGHT, DARK = "#fafafa", "#101010"  # numbers on dark and on bright cells
 SHOWN_LEVEL = 2  # of stress, in the heat map; 1 is mild, 3 is severe
@@ -77,12 +76,8 @@ def _limits() -> dict[str, dict[str, Any]]:
     """Return the keywords of each `@condition` in data/perturb, read from the source, because importing takes long."""
     sources = [file.read_text("utf-8") for file in files("padgs").joinpath("data/perturb").iterdir() if file.is_file()]
     functions = [node for text in sources for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)]
-    return {
-        function.name: {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords if keyword.arg}
-        for function in functions
-        for call in function.decorator_list
-        if isinstance(call, ast.Call)
-    }
+    calls = ((of.name, call) for of in functions for call in of.decorator_list if isinstance(call, ast.Call))
+    return {name: {one.arg: ast.literal_eval(one.value) for one in call.keywords if one.arg} for name, call in calls}
 
 
 LIMITS = _limits()
@@ -123,7 +118,7 @@ class StressedMethod:
         return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells)
 
     @property
-    def score(self) -> float | None:
+    def stability_score(self) -> float | None:
         """Mean over the conditions."""
         return mean_cell(self.means).value
 
@@ -173,15 +168,9 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
     blocks = []
     for title, those in found.items():
         row = _row_maker(presets, those)
-        scores = [
-            row("stability score", lambda one: Cell(one.score)),
-            row("worst quartile", lambda one: Cell(one.worst_quartile)),
-            row("failure rate", lambda one: Cell(one.failure_rate)),
-        ]
-        unstressed = (
-            row(f"unstressed: {name}", lambda one, of=of: _unstressed(one, *of)) for name, of in UNSTRESSED.items()
-        )
-        known = [made for made in unstressed if any(cell.value is not None for cell in made.cells)]
+        scores = [row(of.replace("_", " "), lambda one, of=of: Cell(getattr(one, of))) for of in SCORES]
+        rows = [row(f"unstressed: {of}", partial(_unstressed, columns)) for of, columns in UNSTRESSED.items()]
+        known = [made for made in rows if any(cell.value is not None for cell in made.cells)]
         kept = [row(f"{of[0]} {of[1]}", lambda one, of=of: one.robustness.get(of, Cell())) for of in all_stress(those)]
         conditions = dict.fromkeys(condition for condition, _ in all_stress(those))
         breaks = [row(of, lambda one, of=of: Cell(status=str(one.breakdown(of) or ""))) for of in conditions]
@@ -211,17 +200,14 @@ def limits(run_set: RunSet) -> Table:
             limit = LIMITS.get(condition, {})
             metric, levels = limit.get("metric", "ws_psnr"), limit.get("allowed", ())
             allowed = levels[level - 1] if level <= len(levels) else None
-            lost = row(
-                f"{condition} {level}, {UNITS[metric]}",
-                lambda one, of=(condition, level), metric=metric, allowed=allowed: _lost(one, of, metric, allowed),
-            )
-            rows.append(Row(lost.title, (Cell(allowed), *lost.cells)))
+            words = f"{condition} {level}, {UNITS[metric]}"
+            lost = row(words, partial(_lost, (condition, level), metric, allowed))
+            rows.append(Row(words, (Cell(allowed), *lost.cells)))
         blocks.append(Block(title, tuple(rows)))
     columns = (Column("allowed", 2), *(Column(methods.title(preset), 2) for preset in presets))
     notes = (*footnotes(_references(run_set, found), PROTOCOL), *LIMITS_NOTES)
-    return Table(
-        "limits", "Losses of methods under stress, and their limits", "Condition", columns, tuple(blocks), notes
-    )
+    title = "Losses of methods under stress, and their limits"
+    return Table("limits", title, "Condition", columns, tuple(blocks), notes)
 
 
 @styled
@@ -298,13 +284,14 @@ def _stressed_method(runs: DataFrame, preset: str, where: str) -> StressedMethod
     return StressedMethod(preset, cells, one_setting(reference, where)) if cells and len(reference) else None
 
 
-def _unstressed(one: StressedMethod, name: str, *others: str) -> Cell:
-    if not {name, *others} <= {*one.reference}:
+def _unstressed(columns: Sequence[str], one: StressedMethod) -> Cell:
+    name, *others = columns
+    if not {*columns} <= {*one.reference}:
         return Cell()
-    return mean_cell((one.reference[name] - one.reference[[*others]].sum(axis=1, skipna=False)).dropna().tolist())
+    return mean_cell((one.reference[name] - one.reference[others].sum(axis=1, skipna=False)).dropna().tolist())
 
 
-def _lost(one: StressedMethod, stress: Stress, metric: str, allowed: float | None) -> Cell:
+def _lost(stress: Stress, metric: str, allowed: float | None, one: StressedMethod) -> Cell:
     """Return the mean over seeds, with the status of failed runs, and `BEYOND` if it is more than allowed."""
     runs, column = one.runs.get(stress), f"{PROTOCOL}/{metric}"
     if runs is None:

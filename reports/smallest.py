@@ -9,17 +9,7 @@ from typing import Any
 import numpy as np
 from pandas import DataFrame
 
-from padgs.reports.charts.drawing import (
-    INK,
-    MARKERS,
-    Chart,
-    color_of,
-    figure,
-    lay_out,
-    set_axis,
-    spans,
-    styled,
-)
+from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, set_axis, spans, styled
 from padgs.reports.conditions import OF_TIMES, footnotes, sheets
 from padgs.reports.selection import RunSet, settings
 from padgs.reports.significance import mean_cell
@@ -96,7 +86,6 @@ def curves(runs: DataFrame) -> list[Curve]:
         for run in setting.runs.to_dict("records"):
             title = setting.title + (f", seed {run['seed']}" if several else "")
             image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
-            image = image if image is not None and image.is_file() else None
             found.append(Curve(title, setting.title, setting.preset, run["smallest"], image))
     return found
 
@@ -150,7 +139,7 @@ def charts(run_set: RunSet) -> list[Chart]:
     for name, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
-        if rendered := [curve for curve in curves(own) if curve.image is not None]:
+        if rendered := [curve for curve in curves(own) if curve.image is not None and curve.image.is_file()]:
             try:
                 found.append(_renders(f"{name}_renders", title, rendered, notes))
             except OSError as error:
@@ -173,10 +162,9 @@ def _chart(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) ->
         panel.set_xlabel(words)
     axes[0, 0].set_ylabel("WS-PSNR of test views, dB ↑")
     made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    what = (
-        f"{title}\nsmaller models of the same run; ring: smallest for a loss of {LOSSES[0]} dB, square: {LOSSES[1]} dB"
-    )
-    what += "; thin: further seeds" if len(found) > len(by_method(found)) else ""
+    marks = f"ring: smallest for a loss of {LOSSES[0]} dB, square: {LOSSES[1]} dB"
+    marks += "; thin: further seeds" if len(found) > len(by_method(found)) else ""
+    what = f"{title}\nsmaller models of the same run; {marks}"
     lay_out(made, what)
     return Chart(name, what, made, notes, _numbers(name, found))
 

@@ -46,22 +46,28 @@ class Run:
 def read(source: Path) -> tuple[list[Run], list[ResultError]]:
     """Return the runs of a folder or a store in the order of their names, and an error for each unusable one.
 
+    A copy of a run is unusable beside it; the one with the shorter name of its folder counts.
+
     Raises:
         ResultError: the store cannot be read at all.
     """
     if source.is_file():
         lines = enumerate(results.file_content(source).splitlines(), start=1)
-        loads = [partial(_from_line, line, f"{source}:{number}") for number, line in lines]
+        loads = {f"{source}:{number}": partial(_from_line, line) for number, line in lines}
     else:
-        loads = [partial(_from_folder, path) for path in sorted(source.glob(f"*/{results.FILE_NAME}"))]
-    runs: list[Run] = []
+        paths = sorted(source.glob(f"*/{results.FILE_NAME}"), key=lambda path: (len(path.parent.name), path))
+        loads = {str(path): partial(_from_folder, path) for path in paths}
+    runs: dict[str, Run] = {}
     errors: list[ResultError] = []
-    for load in loads:
+    for where, load in loads.items():
         try:
-            runs.append(load())
+            run = load(where)
+            if (name := run.result.run) in runs:
+                raise ResultError(f"{where} is a copy of run {name}; delete one of them")
+            runs[name] = run
         except ResultError as error:
             errors.append(error)
-    return runs, errors
+    return [runs[name] for name in sorted(runs)], errors
 
 
 def _usable(run: Run, where: str) -> Run:
@@ -133,16 +139,12 @@ def _from_line(line: bytes, where: str) -> Run:
     return _usable(Run(results.decoded(document, where), log, document), where)
 
 
-def _from_folder(file: Path) -> Run:
-    document = results.parsed(results.file_content(file), str(file))
-    probes = [
-        line for line in results.log_lines(file.parent) if all(_is_measured(name, line.get(name)) for name in LOGGED)
-    ]
-    log = {name: [probe[name] for probe in probes] for name in LOGGED}
-    log |= {
-        name: [probe[name] for probe in probes] for name in LOGGED_BY_SOME if probes and all(name in p for p in probes)
-    }
-    return _usable(Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES), str(file))
+def _from_folder(file: Path, where: str) -> Run:
+    document, lines = results.parsed(results.file_content(file), where), results.log_lines(file.parent)
+    probes = [line for line in lines if all(_is_measured(name, line.get(name)) for name in LOGGED)]
+    rare = [name for name in LOGGED_BY_SOME if probes and all(name in probe for probe in probes)]
+    log = {name: [probe[name] for probe in probes] for name in (*LOGGED, *rare)}
+    return _usable(Run(results.decoded(document, where), log, document, file.parent / results.PICTURES), where)
 
 
 def _is_measured(name: str, value: Any) -> bool:

@@ -26,7 +26,7 @@ LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}
 MARKDOWN_MARKS = {None: "{}", BEST: "**{}**"}
 MARKDOWN_SPECIAL = re.compile(r"[\\`*_\[\]|~$#<]|&(?=[#\w])|:(?=//)|(?<=www)\.")
 ENTITIES = {"<": "&lt;", "&": "&amp;"}
-LONGEST = 200  # letters of the name of a chart
+LONGEST = 200  # bytes of the name of a chart
 COLUMNS_OF_A_PAGE = 12  # upright
 
 
@@ -52,8 +52,8 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
             yield f"{made.name}.{extension}", write(made).encode()
     elif isinstance(made, Chart):
         name = file_name(made.name)
-        if len(name) > LONGEST:  # which file systems do not accept with an ending
-            name = f"{name[: LONGEST - 10]}-{hashlib.sha256(name.encode()).hexdigest()[:9]}"
+        if len(long := name.encode()) > LONGEST:  # which file systems do not accept with an ending
+            name = f"{long[: LONGEST - 10].decode(errors='ignore')}-{hashlib.sha256(long).hexdigest()[:9]}"
         yield f"{name}.png", made.png
         if svg and not isinstance(made.figure, Image.Image):
             yield f"{name}.svg", made.svg.encode()

@@ -9,15 +9,7 @@ from typing import Any
 
 from padgs.clock import timed
 from padgs.evaluation.diagnostics import depth_scores, diagnose, oracle, pole_gap
-from padgs.evaluation.evaluate import (
-    Metrics,
-    OnView,
-    angle_weight,
-    cropped_mask,
-    evaluate,
-    finite_or_none,
-    quantized,
-)
+from padgs.evaluation.evaluate import Metrics, OnView, angle_weight, cropped_mask, evaluate, finite_or_none, quantized
 from padgs.evaluation.metrics import mean_color, psnr, sphere_weight, ws_psnr_fitted
 from padgs.evaluation.protocols import Protocol
 from padgs.geometry.panorama import row_latitudes

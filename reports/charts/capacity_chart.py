@@ -6,18 +6,8 @@ from itertools import cycle
 from pandas import DataFrame
 
 from padgs.reports import methods
-from padgs.reports.charts.drawing import (
-    MARKERS,
-    Chart,
-    Label,
-    color_of,
-    figure,
-    lay_out,
-    set_axis,
-    styled,
-    weight_of,
-    write_labels,
-)
+from padgs.reports.charts import drawing
+from padgs.reports.charts.drawing import MARKERS, Chart, Label, color_of, set_axis, styled, weight_of
 from padgs.reports.conditions import footnotes, sheets
 from padgs.reports.measures import costs, metric
 from padgs.reports.selection import RunSet, one_setting
@@ -65,7 +55,7 @@ def _points(runs: DataFrame, preset: str, where: str) -> list[Point]:
 
 @styled
 def _chart(name: str, title: str, points: list[Point], notes: tuple[str, ...]) -> Chart:
-    made, axes = figure(1, 1, *SIZE)
+    made, axes = drawing.figure(1, 1, *SIZE)
     panel, labels = axes[0, 0], []
     set_axis(panel.xaxis, [point.gaussians for point in points], logarithmic=True)
     set_axis(panel.yaxis, [point.quality for point in points])
@@ -80,10 +70,8 @@ def _chart(name: str, title: str, points: list[Point], notes: tuple[str, ...]) -
     panel.set_xlabel("Gaussians when training ends")
     panel.set_ylabel(f"{QUALITY.column.title}, dB ↑")
     what = f"{title}\nquality over the number of Gaussians, trained with each limit; bars: deviation over seeds"
-    lay_out(made, what)
-    write_labels(panel, labels, [(point.gaussians, point.quality, RADIUS) for point in points])
-    rows = [
-        {"preset": point.preset, "limit": point.limit, "gaussians": point.gaussians, **point.cell.numbers}
-        for point in points
-    ]
-    return Chart(name, what, made, notes, DataFrame(rows, dtype=object))
+    drawing.lay_out(made, what)
+    drawing.write_labels(panel, labels, [(point.gaussians, point.quality, RADIUS) for point in points])
+    rows = [{**vars(point), **point.cell.numbers} for point in points]
+    numbers = DataFrame(rows, columns=["preset", "limit", "gaussians", *Cell().numbers], dtype=object)
+    return Chart(name, what, made, notes, numbers)

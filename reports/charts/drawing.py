@@ -171,20 +171,18 @@ def set_axis(axis: Any, values: Sequence[float], logarithmic: bool = False, wors
     """
     from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullLocator
 
-    scaled = [math.log10(value) if logarithmic else value for value in values or [1.0]]
+    values = [value for value in values if math.isfinite(value)] or [1.0]  # inf: the PSNR of an exact render
+    scaled = [math.log10(value) if logarithmic else value for value in values]
     low, high = window(scaled, worse)
     if high == low:
         low, high = low - SINGLE[logarithmic] / 2, high + SINGLE[logarithmic] / 2
     pad = PAD * (high - low)
     low, high = (end([v for v in (low, high, *scaled) if low - pad <= v <= high + pad]) for end in (min, max))
     ends = (10 ** (low - pad), 10 ** (high + pad)) if logarithmic else (low - pad, high + pad)
-    panel, name = axis.axes, axis.axis_name
-    getattr(panel, f"set_{name}scale")("log" if logarithmic else "linear")
-    getattr(panel, f"set_{name}lim")(ends)
-    few = logarithmic and ends[1] < 3 * ends[0]
-    axis.set_major_locator(
-        LogLocator(subs=(1.0, 2.0, 5.0)) if logarithmic and not few else MaxNLocator(6, steps=[1, 2, 5, 10])
-    )
+    name = axis.axis_name
+    axis.axes.set(**{f"{name}scale": "log" if logarithmic else "linear", f"{name}lim": ends})
+    decades = logarithmic and ends[1] >= 3 * ends[0]
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if decades else MaxNLocator(6, steps=[1, 2, 5, 10]))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(EngFormatter(sep="") if ends[1] >= 1e4 else "{x:g}")
     return ends

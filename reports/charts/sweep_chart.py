@@ -83,9 +83,8 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
     of_tables = {experiment for report in REPORTS.values() for experiment in report.experiments}
     known = sorted(runs["experiments"].explode().dropna().unique())
     chosen = request.matches if request.experiment else lambda name: experiment_of(name) not in of_tables
-    names = [name for name in known if chosen(name)]
     found = []
-    for name in names:
+    for name in filter(chosen, known):
         own = runs.loc[[name in of for of in runs["experiments"]]]
         curves, drawn = [], {}
         for place, there in by_place(own).items():
@@ -114,9 +113,7 @@ def chart(sweep: Sweep) -> Chart:
             _draw(panel, curve, index, measure, number)
     for panel in axes.flat[len(sweep.measures) :]:
         panel.set_axis_off()
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    if handles:
-        made.legend(handles, labels, loc="outside lower center", ncols=3)
+    made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     name = "without a name" if sweep.name == AD_HOC else sweep.name
     title = f"Sweep {name}: mean and standard deviation over seeds"
     title += "; dotted: the paper's value" if sweep.key in PAPER_CHOICES else ""
@@ -175,11 +172,11 @@ def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
 def _draw(panel: Any, curve: Curve, index: int, measure: Measure, number: int) -> None:
     color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
     cells = [(x, cells[index]) for x, cells in curve.points]
-    there = [(x, c) for x, c in cells if c.value is not None]
-    xs, values, stds = [x for x, _ in there], [c.value for _, c in there], [c.std or 0.0 for _, c in there]
-    connected = "-" if all(isinstance(x, (int, float)) for x in xs) else ""
+    there = [(x, c.value, c.std or 0.0) for x, c in cells if c.value is not None]
+    xs, values, stds = zip(*there, strict=True) if there else ((), (), ())
+    connected = "-" if all(isinstance(x, (int, float)) for x in xs) else "none"
     panel.errorbar(xs, values, yerr=stds, color=color, linestyle="none", linewidth=1.2, capsize=2.5)
-    panel.plot(xs, values, marker, color=color, markersize=5, linestyle=connected or "none", label=curve.title)
+    panel.plot(xs, values, marker, color=color, markersize=5, linestyle=connected, label=curve.title)
     for x, c in cells:
         if c.status:  # at the bottom edge, on any scale
             bottom, status = panel.get_xaxis_transform(), c.status.upper()

@@ -174,5 +174,5 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
 
 def _protocol(runs: DataFrame) -> str:
     """Return "sphere", or "paper" if no run was scored on the sphere."""
-    there = [m.name for m in QUALITIES if m.name in runs and runs[m.name].notna().any()]
-    return there[0].partition("/")[0] if there else "sphere"
+    known = (of.name for of in QUALITIES if of.name in runs and runs[of.name].notna().any())
+    return next(known, "sphere").partition("/")[0]

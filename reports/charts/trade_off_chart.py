@@ -10,21 +10,8 @@ from typing import Any
 import numpy as np
 
 from padgs.reports import methods
-from padgs.reports.charts.drawing import (
-    ALPHA,
-    INK,
-    PAPER,
-    SOFT,
-    Chart,
-    Label,
-    color_of,
-    figure,
-    lay_out,
-    set_axis,
-    styled,
-    weight_of,
-    write_labels,
-)
+from padgs.reports.charts import drawing
+from padgs.reports.charts.drawing import INK, SOFT, Chart, Label, color_of, set_axis, styled, weight_of, write_labels
 from padgs.reports.charts.trade_off import Point, TradeOff, equal_times, pareto, trade_offs
 from padgs.reports.conditions import unranked
 from padgs.reports.measures import COSTS
@@ -94,12 +81,10 @@ def draw(
     """Return the figure, and for each panel the axes, the marks, the unit of the cost and the labels."""
     quality = trade_off.quality
     shown = shown or (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
-    made, axes = figure(len(shown), 1, *SIZE)
+    made, axes = drawing.figure(len(shown), 1, *SIZE)
     marks = [_marks(trade_off, cost) for cost, _, _ in shown]
-    presets, apart = (
-        [point.preset for point in trade_off.points],
-        unranked(trade_off.runs, equal_images=trade_off.equal_images),
-    )
+    presets = [point.preset for point in trade_off.points]
+    apart = unranked(trade_off.runs, equal_images=trade_off.equal_images)
     for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
         panel.set_xlabel(f"{words}, {unit} ↓")
         panel.set_ylabel(f"{quality.column.title}, dB ↑")
@@ -113,7 +98,7 @@ def draw(
     beyond = wrap(" ".join(_beyond(panels)), LINE * len(shown))
     look = {"title": "\n".join([_conditions(trade_off), *beyond]), "ncols": 8, "fontsize": 8, "title_fontsize": 8}
     made.legend(handles=_handles([mark for of in marks for mark in of]), loc="outside lower center", **look)
-    lay_out(made, trade_off.title)
+    drawing.lay_out(made, trade_off.title)
     return made, [(panel, own, unit, _label(panel, own)) for panel, own, unit in panels]
 
 
@@ -124,21 +109,19 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     The axis of quality shows the later halves of the runs (`drawing.window`) and the best of each. Releases are dashed.
     `NAMED` methods have a colour and a name at their best setting; dips after resets of opacities are left out.
     """
-    curves = _curves(trade_off)
-    if not curves:
+    if not (curves := _curves(trade_off)):
         return None
-    made, axes = figure(1, 1, *TIME_SIZE)
+    made, axes = drawing.figure(1, 1, *TIME_SIZE)
     panel, presets, labels = axes[0, 0], [setting.preset for setting, _, _ in curves], []
-    low, high = set_axis(
-        panel.yaxis, [v for _, _, psnr in curves for v in (*psnr[len(psnr) // 2 :], max(psnr))], worse=-1
-    )
+    later = [value for _, _, psnr in curves for value in (*psnr[len(psnr) // 2 :], max(psnr))]
+    low, high = set_axis(panel.yaxis, later, worse=-1)
     points = [point for _, seconds, psnr in curves for point in zip(seconds, psnr, strict=True)]
     set_axis(panel.xaxis, [s for s, value in points if s > 0 and low <= value <= high], logarithmic=True)
     named = _named(trade_off, curves, low, high)
     for setting, seconds, psnr in curves:
         title, preset, role = setting.title, setting.preset, trade_off.role(setting.preset)
         color = color_of(preset, presets) if preset in named else SOFT
-        look = {"color": color, "alpha": ALPHA[role]} | LOOKS[role]
+        look = {"color": color, "alpha": drawing.ALPHA[role]} | LOOKS[role]
         panel.plot(seconds, psnr, **look)
         panel.plot(seconds[-1], psnr[-1], **look, marker="o", markersize=2 * END_RADIUS)
         if named.get(preset) == title:
@@ -149,7 +132,7 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
     meaning = "without dips after resets; grey: other methods, dashed: as released"
     title = f"{trade_off.title}\nquality over training time, {meaning}"
-    lay_out(made, title)
+    drawing.lay_out(made, title)
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
     write_labels(panel, labels, [*ends, *_along(panel)])
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, trade_off.notes)
@@ -159,12 +142,9 @@ def _along(panel: Any) -> list[tuple[float, float, float]]:
     """Return marks along the lines of a panel, which labels avoid."""
     transform, marks = panel.transData, []
     for line in panel.lines:
-        pixels = transform.transform(line.get_xydata())
-        pieces = [
-            np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / SPACING), endpoint=False) for a, b in pairwise(pixels)
-        ]
-        if pieces:
-            marks += [(x, y, END_RADIUS) for x, y in transform.inverted().transform(np.concatenate(pieces))]
+        for a, b in pairwise(transform.transform(line.get_xydata())):
+            places = np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / SPACING), endpoint=False)
+            marks += [(x, y, END_RADIUS) for x, y in transform.inverted().transform(places)]
     return marks
 
 
@@ -237,15 +217,14 @@ def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, presets: Seque
     x_std, y_std = numbers[cost].std, numbers[trade_off.quality.column.title].std
     if x_std or y_std:
         x_std = [[min(x_std or 0.0, 0.9 * mark.x)], [x_std or 0.0]]  # a logarithmic axis has no zero
-        look = {"color": color, "linewidth": 0.8, "alpha": 0.6 * ALPHA[mark.role], "zorder": 2}
+        look = {"color": color, "linewidth": 0.8, "alpha": 0.6 * drawing.ALPHA[mark.role], "zorder": 2}
         panel.errorbar(mark.x, mark.y, yerr=y_std, xerr=x_std, linestyle="none", **look)
-    look = {"alpha": ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
+    look = {"alpha": drawing.ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
     if mark.role == "release":
         look |= {"facecolors": "none", "edgecolors": color, "linewidths": 1.0}
     else:
         ours = weight_of(mark.point.preset, mark.role) == "bold"
-        edge = {"edgecolors": INK, "linewidths": 1.2} if ours else {"edgecolors": PAPER, "linewidths": 0.5}
-        look |= {"facecolors": color, **edge}
+        look |= {"facecolors": color, "edgecolors": INK if ours else drawing.PAPER, "linewidths": 1.2 if ours else 0.5}
     panel.scatter(mark.x, mark.y, s=mark.area, **look)
 
 
@@ -276,19 +255,18 @@ def _handles(marks: Sequence[Mark]) -> list[Any]:
         look = {"marker": "o", "color": SOFT, "markeredgewidth": 0} | look
         return Line2D([], [], linestyle="none", markersize=math.sqrt(area), label=label, **look)
 
-    handles = []
-    if any(mark.role == "variant" for mark in marks):
-        handles.append(dot(AREA, "variant of a method", alpha=ALPHA["variant"]))
-    if any(mark.role == "release" for mark in marks):
+    handles, roles = [], {mark.role for mark in marks}
+    if "variant" in roles:
+        handles.append(dot(AREA, "variant of a method", alpha=drawing.ALPHA["variant"]))
+    if "release" in roles:
         handles.append(dot(SMALL_AREA, "program as released", markerfacecolor="none", markeredgewidth=1.0))
     return [*handles, Line2D([], [], color=SOFT, linewidth=0.9, label="Pareto front")]
 
 
 def _conditions(trade_off: TradeOff) -> str:
     """Return the conditions that all runs share, so that the image can be read alone."""
-    parts = ["up and to the left is better"]
-    for column in ("resolution", "length"):
-        known = trade_off.runs[column].unique()
-        parts += [known[0]] if len(known) == 1 else []
+    known = (trade_off.runs[column].unique() for column in ("resolution", "length"))  # no length of external models
+    shared = [values[0] for values in known if len(values) == 1 and values[0]]
     seeds = trade_off.runs["seed"].nunique()
-    return ", ".join([*parts, *([f"bars: standard deviation over {seeds} seeds"] if seeds > 1 else [])])
+    bars = [f"bars: standard deviation over {seeds} seeds"] if seeds > 1 else []
+    return ", ".join(["up and to the left is better", *shared, *bars])

@@ -29,6 +29,7 @@ SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-c
 STYLES = ("pannellum.css", "img-comparison-slider.css")
 IMAGE_WIDTH = 1024  # maximum pixels of an embedded panorama
 JPEG_QUALITY = 80
+CHARTS = ("equal_time_chart", "chart", "capacity_chart", "smallest_chart")  # of speed against accuracy
 MAX_VIEWS = 3  # per scene
 MAX_FILES = 90  # renders opened for a page; scenes that no longer fit are left out and named
 
@@ -53,15 +54,14 @@ class Album:
 
 def html(run_set: RunSet) -> str:
     """Return the page with all other reports; a refused report is named at the top."""
-    made: dict[str, list[Any]] = {}
+    made: dict[str, list[Any]] = {name: [] for name in REPORTS}
     refused: list[str] = []
-    for name in REPORTS:
+    for name in (name for name in REPORTS if name not in ("html", "gallery")):
         try:
-            report = run_set.report(name) if name not in ("html", "gallery") else []
+            report = run_set.report(name)
+            made[name] = report if isinstance(report, list) else [report]
         except ReportError as error:
             refused.append(str(error))
-            report = []
-        made[name] = report if isinstance(report, list) else [report]
     tables = [_measured(part) for parts in made.values() for part in parts if isinstance(part, Table)]
     views = album(run_set)
     scenes = {"images": views.images, "scenes": views.scenes, "sets": _scene_sets(run_set.runs)}
@@ -74,9 +74,7 @@ def html(run_set: RunSet) -> str:
         rows_of=rows_of,
         spans=_spans,
         maps=_charts(made["stability"]),
-        charts=_charts(
-            [part for name in ("equal_time_chart", "chart", "capacity_chart", "smallest_chart") for part in made[name]]
-        ),
+        charts=_charts([part for name in CHARTS for part in made[name]]),
         sweeps=_charts(made["sweep"]),
         views=views,
         data=json.dumps(scenes).replace("<", "\\u003c"),  # no end of script

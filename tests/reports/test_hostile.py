@@ -11,13 +11,14 @@ from dataclasses import replace
 
 import pytest
 from PIL import Image
-from support.made_up import compared, result, run_set, small, write
+from support.made_up import budgets, compared, external, result, run_set, scored, small, swept, write
 from typer.testing import CliRunner
 
 from padgs import results
 from padgs.checks import printable
 from padgs.cli.commands import app
 from padgs.reports import REPORTS, store
+from padgs.reports.charts.drawing import Chart
 from padgs.reports.writers import files, latex_text, markdown_text
 from padgs.results import Scores
 
@@ -123,6 +124,29 @@ def test_a_run_that_cannot_be_is_left_out_by_name(what, tmp_path):
     found, broken = store.read(tmp_path)
     assert [run.result.run for run in found] == [good.run] and len(broken) == 1
     assert "hostile" in str(broken[0]) and len(str(broken[0])) < 600
+
+
+EXACT = {"scores": scored(math.inf)}  # as of somebody who scores the photographs themselves
+
+
+@pytest.mark.parametrize(
+    ("name", "made"),
+    [
+        ("chart", [external(25.0, "A & B"), external(26.0, "C")]),
+        ("sweep", [replace(run, **EXACT) if run.seed else run for run in swept(scenes=["synthetic-room"], seeds=2)]),
+        ("capacity_chart", [replace(run, **EXACT) for run in budgets({("padgs", 100): 20.0, ("padgs", 200): 21.0})]),
+        ("findings", [replace(run, **EXACT) if run.method == "padgs" else run for run in compared(seeds=2)]),
+    ],
+)
+def test_exact_renders_and_other_programs_alone_end_no_report(name, made):
+    assert dict(files(run_set(made).report(name)))
+
+
+def test_names_in_other_scripts_give_files_of_their_own_with_names_that_file_systems_accept():
+    charts = [Chart(name, "", Image.new("RGB", (1, 1))) for name in ("客厅", "卧室", "客" * 90, "客" * 91)]
+    names = [name for name, _ in files(charts)]
+    assert names[:2] == ["客厅.png", "卧室.png"] and len({*names}) == 4
+    assert max(len(name.encode()) for name in names) < 240
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "9" * 5000])

@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -117,3 +118,13 @@ def test_a_damaged_line_is_named_and_left_out_and_strict_fails(runs, tmp_path):
     with pytest.raises(ResultError, match="store.jsonl:1 .* was edited"):
         store.add([], path)
     assert path.read_bytes() == before, "what was damaged may be mended; it is not thrown away"
+
+
+def test_a_copy_of_a_run_is_left_out_by_name_and_the_table_is_made(runs, tmp_path):
+    names = sorted(path.name for path in runs.iterdir())
+    for copy in (f"a_backup_of_{names[0]}", f"{names[1]} (copy)"):
+        shutil.copytree(runs / names["backup" not in copy], runs / copy)
+    found, broken = store.read(runs)
+    assert [run.result.run for run in found] == names and [run.renders.parent.name for run in found] == names
+    assert len(broken) == 2 and all("is a copy of run" in str(error) for error in broken)
+    report("table1", runs, "--out", tmp_path / "out")
