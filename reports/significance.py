@@ -40,9 +40,9 @@ def over_scenes(runs: DataFrame, scenes: Sequence[Place], measures: Sequence[Mea
     for seed, place, numbers in zip(runs["seed"], runs["place"], numbers_of(runs, measures), strict=True):
         by_seed.setdefault(seed, {})[place] = numbers
     complete = [[of[place] for place in scenes] for _, of in sorted(by_seed.items()) if of.keys() >= {*scenes}]
-    sums = [[math.fsum(numbers) for numbers in zip(*of, strict=True)] for of in complete]
-    means = ([total / len(scenes) for total in totals if not math.isnan(total)] for totals in zip(*sums, strict=True))
-    return list(map(mean_cell, means)) if complete else [Cell() for _ in measures]
+    means = [[math.fsum(numbers) / len(scenes) for numbers in zip(*of, strict=True)] for of in complete]
+    known = ([mean for mean in of if not math.isnan(mean)] for of in zip(*means, strict=True))
+    return list(map(mean_cell, known)) if complete else [Cell() for _ in measures]
 
 
 def numbers_of(runs: DataFrame, measures: Sequence[Measure]) -> NDArray:
@@ -68,9 +68,8 @@ def marks(block: Block, columns: tuple[Column, ...]) -> list[dict[int, str]]:
     """Return row -> BEST or SECOND for each column of a block; see the notes in `tables.yaml`."""
     if block.across is None:
         return [emphasis(block, index, columns) for index in range(len(columns))]
-    rows = [
-        emphasis(Block("", tuple(Row("", (cell,)) for cell in row.cells)), 0, (block.across,)) for row in block.rows
-    ]
+    turned = (Block("", tuple(Row("", (cell,)) for cell in row.cells)) for row in block.rows)
+    rows = [emphasis(row, 0, (block.across,)) for row in turned]
     return [{number: row[index] for number, row in enumerate(rows) if index in row} for index in range(len(columns))]
 
 
