@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed, view_name
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, first_of, listed, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
@@ -134,7 +134,7 @@ def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_F
         if not (folder / given).is_dir():
             raise DataError(f"data.images={given}: there is no folder {folder / given}")
         return folder / given
-    return next((folder / name for name in usual if (folder / name).is_dir()), folder)
+    return first_of(folder, usual, Path.is_dir) or folder
 
 
 def image_names(folder: Path) -> list[str]:
@@ -145,17 +145,19 @@ def image_names(folder: Path) -> list[str]:
 
 
 def file_names(folder: Path) -> list[str]:
-    """Return all files below a folder, relative to it and sorted, without hidden and `SKIPPED` ones."""
+    """Return all files below a folder, relative to it and sorted, without hidden and `SKIPPED` ones; links count."""
     found: list[str] = []
-    for parent, folders, files in os.walk(folder):
+    seen: set[Path] = set()
+    for parent, folders, files in os.walk(folder, followlinks=True):
         here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and not _is_skipped(here / name)]
+        is_skipped = here != folder and any(all((here / file).exists() for file in signs) for signs in SKIPPED)
+        if is_skipped or here.resolve() in seen:  # a link may lead back
+            folders.clear()
+            continue
+        seen.add(here.resolve())
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [(here / name).relative_to(folder).as_posix() for name in files if not name.startswith(".")]
     return sorted(found)
-
-
-def _is_skipped(folder: Path) -> bool:
-    return any(all((folder / file).exists() for file in files) for files in SKIPPED)
 
 
 def refuse_clashes(names: Sequence[str]) -> None:
@@ -163,6 +165,8 @@ def refuse_clashes(names: Sequence[str]) -> None:
     seen: dict[str, str] = {}
     for name in names:
         key = view_name(name).casefold()
+        if seen.get(key) == name:
+            raise DataError(f"the image {name!r} has two poses; remove one")
         if key in seen:
             both = f"{seen[key]!r} and {name!r}"
             raise DataError(f"the images {both} would share one name (without case and extension); rename one")

@@ -47,6 +47,12 @@ def files_with(folder: Path, suffix: str) -> list[Path]:
     return sorted(file for file in files if file.is_file())
 
 
+def first_of(folder: Path, names: Iterable[str], kind: Callable[[Path], bool] = Path.is_file) -> Path | None:
+    """Return what has the first of the names in a folder, in any case, and is of a kind; None if there is none."""
+    there = {path.name.casefold(): path for path in sorted(folder.glob("*")) if kind(path)}
+    return next((there[name.casefold()] for name in names if name.casefold() in there), None)
+
+
 _NUMBER = re.compile(r"(\d+)")
 
 

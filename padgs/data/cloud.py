@@ -142,8 +142,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
     if not len(points):
         why = "training starts from a point cloud"
         raise DataError(f"{where} holds no points; {why}: set data.points to a PLY file, or to random")
-    bad = (~points.float().isfinite().all(1)).sum().item()
-    if bad:
+    if bad := (~points.float().isfinite().all(1)).sum().item():
         raise DataError(f"{bad} of {len(points)} points of {where} are not finite; remove them from the cloud")
     if colors is None:
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)

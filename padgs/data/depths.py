@@ -80,10 +80,9 @@ def with_depths(
     files, meaning, notes = ({}, None, []) if options.depth == "none" else _depth_files(capture)
     if meaning is None:
         return list(views), [], notes
-    made, digests, sizes, total = [], [f"{meaning.measure}{meaning.unit}"], set(), 0
-    for view, frame in zip(views, capture.frames, strict=True):
+    made, digests, sizes, total = list(views), [f"{meaning.measure}{meaning.unit}"], set(), 0
+    for i, (view, frame) in enumerate(zip(views, capture.frames, strict=True)):
         if (file := files.get(frame.name)) is None:
-            made.append(view)
             continue
         if meaning.measure == "z" and view.lens is None:
             raise DataError(
@@ -103,7 +102,7 @@ def with_depths(
         digests.append(f"{frame.name}:{hashlib.sha256(read_bytes(file)).hexdigest()}")
         total += values.nbytes
         depth = Depth(file, meaning, view, values if total <= options.cache_bytes else None)
-        made.append(replace(view, load_depth=depth, depth_is_relative=meaning.measure in RELATIVE))
+        made[i] = replace(view, load_depth=depth, depth_is_relative=meaning.measure in RELATIVE)
     what = MEASURES[meaning.measure]
     what += "" if meaning.measure in RELATIVE else f" in steps of {meaning.unit:g} world units"
     note = f"depth: {len(files)} of {len(views)} views, {listed(sorted(sizes))}, {what} (by {meaning.source})"

@@ -65,8 +65,7 @@ def refuse_rotated(image: Image.Image, path: object) -> None:
     """Refuse pixels that are stored rotated, by EXIF or XMP."""
     has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
     by_exif = image.getexif().get(_ORIENTATION) if has_exif else 1
-    orientations = {"EXIF": by_exif, "XMP": stated(_xmp(image), "Orientation")}
-    for source, orientation in orientations.items():
+    for source, orientation in {"EXIF": by_exif, "XMP": stated(_xmp(image), "Orientation")}.items():
         if str(orientation) not in ("None", "0", "1"):
             raise DataError(
                 f"{path} carries {source} orientation {orientation}: its pixels are stored rotated, and it is unknown "
@@ -93,8 +92,7 @@ def refuse_several_pictures(image: Image.Image, path: object) -> None:
 def crop_of(image: Image.Image, path: object) -> Crop | None:
     """Return where the picture lies in its panorama (GPano); None if it is all; a DataError if numbers disagree."""
     xmp = _xmp(image)
-    projection = stated(xmp, "ProjectionType")
-    if projection is not None and projection.casefold() != "equirectangular":
+    if (projection := stated(xmp, "ProjectionType") or "equirectangular").casefold() != "equirectangular":
         raise DataError(
             f"{path} says that its projection is {projection!r}, not equirectangular; convert it with the program that "
             f"made it, or {_REMOVE}"
@@ -107,9 +105,9 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
     usual = (image.width, image.height, image.width, image.height, 0, 0)
     try:
         full_width, full_height, width, height, left, top = (
-            int(value if text is None else text) for value, text in zip(usual, texts.values(), strict=True)
+            round(float(value if text is None else text)) for value, text in zip(usual, texts.values(), strict=True)
         )
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise DataError(contradiction) from error
     is_inside = min(left, top) >= 0 and left + width <= full_width <= _WIDEST and top + height <= full_height <= _WIDEST
     # Another program may have resized the picture, but not changed its proportions.

@@ -15,7 +15,7 @@ from unicodedata import normalize
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture, DataError, listed
+from padgs.data.capture import Capture, DataError, first_of, listed
 from padgs.data.image_metadata import Crop
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
@@ -123,8 +123,8 @@ def find_masks(
             shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule)
         masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}{':inverted' * mask.inverted}")
-    if (median(shown.values()) if shown else 1) < 1 - MAX_HIDDEN:
-        hides = f"the masks hide {1 - median(shown.values()):.0%} of the sphere"
+    if shown and (hidden := 1 - median(shown.values())) > MAX_HIDDEN:
+        hides = f"the masks hide {hidden:.0%} of the sphere"
         if given == "auto":
             where = os.path.relpath(next(iter(inspected)), capture.folder).split(os.sep)[0]
             raise DataError(
@@ -175,9 +175,8 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
             raise DataError(f"the mask {absent[0]} that {capture.format} names does not exist; set data.mask=none")
         return named, f"masks: those that {capture.format} names, for {len(named)} of {len(capture.frames)} views"
     if given is None:
-        usual = [capture.folder / name for name in SCENE_MASKS if (capture.folder / name).is_file()]
-        usual += [capture.folder / name for name in MASK_FOLDERS if (capture.folder / name).is_dir()]
-        given = next(iter(usual), capture.image_folder)
+        folder = capture.folder
+        given = first_of(folder, SCENE_MASKS) or first_of(folder, MASK_FOLDERS, Path.is_dir) or capture.image_folder
     if given.is_file():
         panoramas = [frame.name for frame in capture.frames if frame.lens is None]
         which = "every view" if len(panoramas) == len(capture.frames) else "every panorama"
@@ -187,10 +186,8 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
     if beside and not found:
         return {}, None
     if not found:
-        raise DataError(
-            f"{given} holds no mask named like an image (such as {capture.frames[0].name}.png); rename them, or set "
-            "data.mask=none"
-        )
+        such = f"named like an image (such as {capture.frames[0].name}.png)"
+        raise DataError(f"{given} holds no mask {such}; rename them, or set data.mask=none")
     turned = " (white is ignored)" if any(path.name.startswith(INVERTED) for path in found.values()) else ""
     return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views{turned}"
 

@@ -32,16 +32,10 @@ def split_frames(
 ) -> Split:
     """Decide for each frame whether it is a training view, a test view, or unused.
 
-    A DataError says that a list holds unknown or ambiguous names, that lists overlap, or that a side is empty.
-
-    Args:
-        names: frame names with extension, sorted.
-        folder: holds `train.txt` and `test.txt`, if any: one name a line, with or without extension.
-        mode: files; every (views 0, k, 2k, ... are test views); all (no test views); auto: the format's own lists, else
-            files if there is a list, else every.
-        every: k.
-        stated: the format's own lists.
-        unposed: names of images without a pose, for clear error messages.
+    `names` are those of frames, with extension and sorted; `folder` holds `train.txt` and `test.txt`, if any: one name
+    a line, with or without extension. `mode` is files; every (views 0, k, 2k, ... are test views, k is `every`); all
+    (no test views); or auto: the lists that the format has `stated`, else files if there is a list, else every. A
+    DataError says that a list holds unknown, ambiguous or `unposed` names, that lists overlap, or that a side is empty.
     """
     if mode == "all":
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
@@ -60,15 +54,13 @@ def split_frames(
         if side not in chosen:
             chosen[side] = set(range(len(names))) - chosen[other]
             notes.append(f"there is no {side} list; all views missing from the {other} list are used")
-    both = chosen["train"] & chosen["test"]
-    if both:
+    if both := chosen["train"] & chosen["test"]:
         overlap = listed(names[i] for i in sorted(both))
         raise DataError(f"train and test list overlap: {overlap}; a view is one or the other")
     for side in ("train", "test"):
         if not chosen[side]:
             raise DataError(f"the {side} split is empty; name at least one view, or set data.split=every")
-    unused = len(names) - len(chosen["train"]) - len(chosen["test"])
-    if unused:
+    if unused := len(names) - len(chosen["train"]) - len(chosen["test"]):
         notes.append(f"{unused} posed views are in neither list and are not used")
     return Split(tuple(sorted(chosen["train"])), tuple(sorted(chosen["test"])), tuple(notes))
 
@@ -141,11 +133,10 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
         if not found:
             absent.append(line)
         chosen |= found
+    there = {key for name in unposed for key in spellings(name)}
+    if without := [line for line in absent if there & set(spellings(line))]:
+        raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
     if absent:
-        known = {key for name in unposed for key in spellings(name)}
-        without = [line for line in absent if known & set(spellings(line))]
-        if without:
-            raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
         known = f"the data set has {listed(names)}"
         raise DataError(f"the {which} names images that do not exist: {listed(absent)}; {known}")
     return chosen

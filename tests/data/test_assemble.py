@@ -71,8 +71,11 @@ def test_images_and_cameras_of_different_size(folder: Path) -> None:
         load(folder)
 
 
-def test_names_that_differ_in_case_only_are_refused(folder: Path) -> None:
+def test_names_that_differ_in_case_only_and_second_poses_are_refused(folder: Path) -> None:
     lines = (folder / "sparse/0/images.txt").read_text()
+    (folder / "sparse/0/images.txt").write_text(lines.replace("pano_03.png", "pano_02.png"))
+    with pytest.raises(DataError, match="the image 'pano_02.png' has two poses; remove one"):
+        load(folder)
     (folder / "sparse/0/images.txt").write_text(lines.replace("pano_03.png", "PANO_02.jpg"))
     with pytest.raises(DataError, match="'PANO_02.jpg' and 'pano_02.png' would share one name"):
         load(folder)

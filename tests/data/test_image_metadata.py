@@ -71,7 +71,7 @@ def test_a_part_of_a_panorama_is_padded(extension, elements, tmp_path):
 
 
 def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_part(tmp_path):
-    larger = {name: value if isinstance(value, str) else 10 * value for name, value in GPANO.items()}
+    larger = {name: value if isinstance(value, str) else 10.0 * value for name, value in GPANO.items()}
     PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**larger))
     found = inspect(tmp_path / "a.jpg")
     assert found.crop is not None and (found.crop.left, found.crop.top, found.width) == (20, 6, 160)

@@ -32,11 +32,7 @@ ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.j
 
 
 def detect(path: Path) -> tuple[str, str]:
-    """Detect the format of a data set; returns its name and the reason in words.
-
-    Raises:
-        DataError: no known format; the message lists the files that identify one.
-    """
+    """Detect the format of a data set; return its name and the reason. A DataError lists what identifies a format."""
     found: dict[str, str] = {}
     for format, files in SIGNS:
         if not files and path.is_dir() and (model := find_model(path)):

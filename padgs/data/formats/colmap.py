@@ -45,15 +45,9 @@ def find_model(path: Path) -> Path | None:
 
 
 def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture:
-    """Read a COLMAP model.
+    """Read a COLMAP model of a data set; missing or damaged files are a DataError.
 
-    Args:
-        path: the data set's folder.
-        options: `images` and `points` are used.
-        model: the folder with the model's files; None searches the usual places.
-
-    Raises:
-        DataError: missing or damaged files.
+    `model` is the folder with the model's files; None searches the usual places in the data set's folder `path`.
     """
     model = model or find_model(path)
     if model is None:
@@ -73,15 +67,9 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     points = read_points(files["points3D"]) if "points3D" in files else Points({}, colored, frozenset())
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
     notes = [*_file_notes(path, model, files, colored is not None), *_reference_notes(images, points)]
-    return Capture(
-        format="colmap",
-        folder=path,
-        image_folder=folder,
-        frames=frames,
-        cloud=points.cloud,
-        tracks=lambda: _tracks(images, points.row_of),
-        notes=(*notes, *_frame_notes(model, files["images"], images)),
-    )
+    notes += _frame_notes(model, files["images"], images)
+    tracks = partial(_tracks, images, points.row_of)
+    return Capture("colmap", path, folder, frames, points.cloud, tracks=tracks, notes=tuple(notes))
 
 
 def pose_of(image: Image, where: str) -> Tensor:
@@ -92,15 +80,12 @@ def pose_of(image: Image, where: str) -> Tensor:
 
 def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) -> list[str]:
     """Say which files are used where there are several of one kind."""
-    notes = []
+    notes = ["points: from a PLY file beside the model, which has no points3D of its own"] if colored else []
     parts = [part.name for part in sorted(model.parent.glob("*")) if part != model and find_file(part, "images")]
     if model != path and parts:
         notes.append(f"the model has several parts; the largest, {model.name}, is used, not {listed(parts)}")
-    double = [file.name for file in files.values() if file.suffix == ".bin" and file.with_suffix(".txt").is_file()]
-    if double:
+    if double := [file.name for file in files.values() if file.suffix == ".bin" and file.with_suffix(".txt").is_file()]:
         notes.append(f"the model is there as text and binary; {listed(double)} are used, not the text files")
-    if colored:
-        notes.append("points: from a PLY file beside the model, which has no points3D of its own")
     return notes
 
 
@@ -114,12 +99,8 @@ def _frame_notes(model: Path, file: Path, images: list[Image]) -> list[str]:
         if (stated := frames.get(image.id))
         and not any(np.allclose(stated, sign * np.array(image.pose), 1e-6, 1e-6) for sign in (1, flip))
     ]
-    if not differing:
-        return []
-    return [
-        f"frames.bin states other poses than {file.name} ({listed(differing)}); those of {file.name} are used: remove "
-        "the file that is out of date"
-    ]
+    used = f"those of {file.name} are used: remove the file that is out of date"
+    return [f"frames.bin states other poses than {file.name} ({listed(differing)}); {used}"] if differing else []
 
 
 def _reference_notes(images: list[Image], points: Points) -> list[str]:

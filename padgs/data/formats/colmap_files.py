@@ -91,11 +91,7 @@ def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
 
 
 def read_images(file: Path) -> Iterator[Image]:
-    """Read the images file. In text, the line of observations after an image may be empty or missing.
-
-    Raises:
-        DataError: a damaged file; the message names the line.
-    """
+    """Read the images file. In text, the line of observations after an image may be empty or missing."""
     if file.suffix == ".txt":
         kinds, image = (int, *[float] * 7, int, str), None
         for number, line in _lines(file):
@@ -203,11 +199,7 @@ class _Cursor:
 
 
 def _entries(file: Path, entry: Callable[[_Cursor], T]) -> list[T]:
-    """Read the entries of a binary file.
-
-    Raises:
-        DataError: the file is truncated, or longer than its entries.
-    """
+    """Read the entries of a binary file; a DataError if it is truncated, or longer than its entries."""
     cursor = _Cursor(file)
     try:
         (count,) = cursor.take("Q")

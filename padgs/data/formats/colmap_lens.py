@@ -20,8 +20,7 @@ POLYNOMIAL_FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RA
 def lens_of(camera: Camera, where: str, width: int, height: int) -> Pinhole | RayTable:
     """Return the camera of photographs at a size; `where` names one in errors.
 
-    Raises:
-        DataError: a camera model or parameters that COLMAP does not have, or pixels without a ray.
+    A DataError says that COLMAP does not have the model or its parameters, or that pixels have no ray.
     """
     try:
         return _lens(camera, width, height)

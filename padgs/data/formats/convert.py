@@ -34,11 +34,8 @@ def convert(
 
     Images are copied byte for byte, unless they are reduced (`options.width`), padded or converted to sRGB. The split
     is written as decided; masks, including the row rule of 360Roam, become mask.png or masks/. `known` sets the scale
-    of the written world. `progress` is called with (images written, total).
-
-    Raises:
-        DataError: `load` would refuse the source, or the destination cannot be written; then it stays unchanged.
-        ValueError: unknown format.
+    of the written world. `progress` is called with (images written, total). A DataError says that `load` would refuse
+    the source, or that the destination cannot be written; then it stays unchanged. An unknown format is a ValueError.
     """
     if to not in WRITERS:
         raise ValueError(f"unknown format {to!r}; known: {', '.join(WRITERS)}")

@@ -63,11 +63,7 @@ class Json:
         return check_name(self.text(), self.where)
 
     def path_in(self, folder: Path) -> Path:
-        """Return the file of a name, which may be found by its end, in a folder.
-
-        Raises:
-            DataError: the name points outside the folder, and no end of it is there.
-        """
+        """Return the file of a name in a folder; a DataError if it points outside, and no end of it is there."""
         name = self.name()
         if is_inside(name) and (folder / name).is_file():
             return folder / name
@@ -77,11 +73,7 @@ class Json:
         return (found or [folder / name])[0]
 
     def numbers(self, *shape: int) -> Tensor:
-        """Return a nested list of numbers as a float64 tensor, of the given shape if there is one.
-
-        Raises:
-            DataError: not numbers, or another shape.
-        """
+        """Return nested numbers as a float64 tensor; a DataError if they are none, or of another shape than given."""
         if not _is_numbers(self.value):
             raise DataError(f"{self.where} is not an array of numbers; texts, booleans and nulls are none")
         try:
@@ -104,11 +96,7 @@ def _is_numbers(value: Any) -> bool:
 
 
 def read_json(path: Path) -> Json:
-    """Read a JSON file.
-
-    Raises:
-        DataError: missing, unreadable or not JSON; the message names the line.
-    """
+    """Read a JSON file; a DataError if it cannot be read, or names the line that is not JSON."""
     try:
         return Json(json.loads(read_bytes(path)), str(path))
     except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, huge numbers, deep nesting

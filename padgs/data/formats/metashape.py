@@ -34,8 +34,7 @@ def find_xml(path: Path) -> Path | None:
 def read(path: Path, options: DataOptions) -> Capture:
     """Read the enabled and aligned cameras of the chunk with most of them.
 
-    Raises:
-        DataError: no XML, no aligned camera, a sensor that is not spherical, or components without a common frame.
+    A DataError: no XML, no aligned camera, a sensor that is not spherical, or components without a common frame.
     """
     file = find_xml(path)
     if file is None:
@@ -83,15 +82,9 @@ def read(path: Path, options: DataOptions) -> Capture:
     readings = [("points in the frame of the chunk", world), ("points in the frame of the world", same)]
     if len(components) == 1:
         readings.append(("points in the frame of the component", world @ next(iter(components.values()))))
-    return Capture(
-        format="metashape",
-        folder=file.parent,
-        image_folder=folder,
-        frames=tuple(frames),
-        cloud=read_ply(plys[0]) if plys else None,
-        notes=tuple(notes),
-        readings=tuple(Reading(words, same, matrix) for words, matrix in readings),
-    )
+    cloud = read_ply(plys[0]) if plys else None
+    possible = tuple(Reading(words, same, matrix) for words, matrix in readings)
+    return Capture("metashape", file.parent, folder, tuple(frames), cloud, notes=tuple(notes), readings=possible)
 
 
 def _cameras(chunk: XML.Element) -> Iterator[tuple[str, XML.Element]]:

@@ -23,16 +23,10 @@ TRANSFORMS = "dataparser_transforms.json"
 def read_path(
     file: Path, frames: int | None, up: tuple[float, float, float], transforms_json: Path | None = None
 ) -> Tensor:
-    """Read the poses [F, 4, 4] of a path file.
+    """Read the poses [F, 4, 4] of a file of keyframes, or a camera path of nerfstudio; a DataError names the place.
 
-    Args:
-        file: keyframes, or a camera path of nerfstudio.
-        frames: number of poses, resampled evenly; None: a camera path as it is, or 30 poses between two keyframes.
-        up: default up direction of keyframes with look_at.
-        transforms_json: the `transforms.json` from which the scene was read, if any.
-
-    Raises:
-        DataError: unreadable file, or of neither kind; the message names the place in the file.
+    Poses are resampled evenly to a number of `frames`; None: a camera path as it is, or 30 poses between two keyframes.
+    `up` is the default of keyframes with look_at. `transforms_json` is the file from which the scene was read, if any.
     """
     if not file.exists():
         raise DataError(f"the path {file} does not exist; known: {', '.join(PATHS)}, or a JSON file")
@@ -65,9 +59,8 @@ def _keyframe(entry: Json, up: Tensor) -> Tensor:
 
 
 def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -> list[Tensor]:
-    scale, transform = 1.0, torch.eye(4, dtype=torch.float64)
-    if transforms.is_file():
-        scale, transform = nerfstudio_world(transforms, transforms_json)
+    no_change = 1.0, torch.eye(4, dtype=torch.float64)
+    scale, transform = nerfstudio_world(transforms, transforms_json) if transforms.is_file() else no_change
     poses = []
     for entry in cameras.entries():
         stated = entry["camera_to_world"]
@@ -82,11 +75,7 @@ def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -
 
 
 def nerfstudio_world(normalized: Path, transforms_json: Path | None) -> tuple[float, Tensor]:
-    """Return s and T [4, 4]: nerfstudio's world is s (T @ x) for x in the world of the data set.
-
-    Raises:
-        DataError: a file is unreadable, or has no transform and scale.
-    """
+    """Return s and T [4, 4]: nerfstudio's world is s (T @ x) for x in the data set's; a DataError without them."""
     values = read_json(normalized)  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
     applied = Json({}, "") if transforms_json is None else read_json(transforms_json)
     before, factor = applied.get("applied_transform"), applied.get("applied_scale")

@@ -93,8 +93,7 @@ def rotation_from_vector(vector: Tensor, where: str) -> Tensor:
 def checked_rotation(rotation: Tensor, where: str) -> Tensor:
     """Return the rotation nearest to a [3, 3] matrix, which must be one up to rounding, as float64.
 
-    Raises:
-        DataError: not finite, scaled, left-handed or not orthogonal; the message says which.
+    A DataError says that it is not finite, scaled, left-handed or not orthogonal.
     """
     rotation = _finite(rotation, where)
     if rotation.shape != (3, 3):

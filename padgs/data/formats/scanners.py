@@ -24,11 +24,7 @@ COLUMNS = ("pano_pos_x", "pano_pos_y", "pano_pos_z", "pano_ori_w", "pano_ori_x",
 
 
 def read_navvis(path: Path, options: DataOptions) -> Capture:
-    """Read `pano-poses.csv` and a cloud.
-
-    Raises:
-        DataError: a column is missing, or a row is not valid; the message names the line.
-    """
+    """Read `pano-poses.csv` and a cloud; a DataError names the line that lacks a column or is not valid."""
     file = path if path.is_file() else path / "pano-poses.csv"
     file = file if path.is_file() or file.exists() else path / "pano" / "pano-poses.csv"
     lines = [(number, line) for number, line in enumerate(read_lines(file), 1) if line.strip()]
@@ -62,10 +58,8 @@ def read_navvis(path: Path, options: DataOptions) -> Capture:
 def read_e57(path: Path, options: DataOptions) -> Capture:
     """Read panoramas, poses and points of an E57 file, or of all in a folder.
 
-    The images are written to the folder NAME_images beside the file, once.
-
-    Raises:
-        DataError: pye57 is missing, the file is damaged, or it holds no panoramas or no poses.
+    The images are written to the folder NAME_images beside the file, once. A DataError says that pye57 is missing, that
+    the file is damaged, or that it holds no panoramas or no poses.
     """
     files = [path] if path.is_file() else files_with(path, ".e57")
     if not files:

@@ -22,8 +22,7 @@ _PLY = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pcd.ply", "scene.ply")
 def read(path: Path, options: DataOptions) -> Capture:
     """Read `transforms.json`, or the pair of files for train and test.
 
-    Raises:
-        DataError: another camera model, an invalid pose, or a path outside the folder.
+    A DataError: another camera model, an invalid pose, or a path outside the folder.
     """
     file = file_in(path, FILE)
     folder = file.parent
@@ -51,23 +50,12 @@ def read(path: Path, options: DataOptions) -> Capture:
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
     named, mask = first.get("ply_file_path"), first.get("mask")
     cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
-    return Capture(
-        format="transforms",
-        folder=folder,
-        image_folder=root / prefix,
-        frames=tuple(frames),
-        cloud=cloud,
-        split=split or None,
-        mask=mask.text() if mask else "auto",  # as `padgs split` states it
-    )
+    meant = mask.text() if mask else "auto"  # as `padgs split` states it
+    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant)
 
 
 def transforms_file(path: str | None, format: str) -> Path | None:
-    """Return the `transforms.json` behind `data.path` and `data.format`; None for other formats.
-
-    Raises:
-        DataError: no known format.
-    """
+    """Return the `transforms.json` behind `data.path` and `data.format`; None for others, a DataError for none."""
     if path is None or (detect(Path(path))[0] if format == "auto" else format) not in ("transforms", "nerfstudio"):
         return None
     file = file_in(Path(path), FILE)
@@ -85,23 +73,13 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
         )
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]
     mask = frame.get("mask_path")
-    width, height = (frame.get(key) or meta.get(key) for key in ("w", "h"))
-    return Frame(
-        name=name,
-        image=root / name,
-        cam_from_world=cam_from_opengl_pose(matrix.numbers(), matrix.where),
-        width=width and width.whole(),
-        height=height and height.whole(),
-        mask=mask and mask.path_in(root),
-        share=1.0 if (share := frame.get("share")) is None else _share(share),
-    )
-
-
-def _share(stated: Json) -> float:
+    width, height = (side and side.whole() for side in (frame.get(key) or meta.get(key) for key in ("w", "h")))
+    pose = cam_from_opengl_pose(matrix.numbers(), matrix.where)
+    stated = frame.get("share") or Json(1.0, "share")
     share = stated.numbers()
     if share.ndim or not 0 < share <= 1:
         raise DataError(f"{stated.where} is {stated.value}; it must be a number above 0 and at most 1, for each pass")
-    return share.item()
+    return Frame(name, root / name, pose, width, height, mask and mask.path_in(root), share=share.item())
 
 
 def _name(path: Json) -> str:

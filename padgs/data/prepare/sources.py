@@ -18,6 +18,7 @@ from padgs.data.capture import Capture, DataError, Frame, listed
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks
+from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
@@ -43,8 +44,7 @@ def extract_frames(
     installed, that the file cannot be decoded, or that its frames are no panoramas.
     """
     written = 0
-    for frame in _sharpest(video, per_second, progress):
-        written += 1
+    for written, frame in enumerate(_sharpest(video, per_second, progress), 1):
         Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
     if written == 0:
         raise DataError(f"{video} holds no frames")
@@ -146,45 +146,36 @@ def find_source(path: Path, mask: str) -> Source:
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
     folder = image_folder(path, None)
-    names = panoramas(folder)
+    names = [check_name(name, str(folder)) for name in panoramas(folder)]
     others, ways_out = _others(folder)
     if len(names) < 2:
-        besides = f" (left out: {others})" if others else ""
-        found = f"{folder} holds {len(names)} images{besides}"
+        found = f"{folder} holds {len(names)} images{f' (left out: {others})' if others else ''}"
         raise DataError(f"{found}; structure from motion needs at least two{ways_out}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
     for name in names[:: -(-len(names) // DECODED)]:
         refuse_dual_fisheye(decode(folder / name), folder / name)
-    no_pose = torch.eye(4, dtype=torch.float64)
+    no_pose, expected = torch.eye(4, dtype=torch.float64), mask_folder(path)
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
-    capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
+    capture = Capture("images", expected, folder, frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, mask_notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
     notes = [*image_files.notes_on(list(images.values())), *mask_notes]
     if others:
         notes.append(f"left out: {others}{ways_out}")
-    expected = mask_folder(path)
-    scene_masks = [name for name in image_names(folder) if PurePosixPath(name).name in SCENE_MASKS]
+    scene_masks = [name for name in image_names(folder) if PurePosixPath(name).name.lower() in SCENE_MASKS]
     if unused := [name for name in scene_masks if mask == "auto" and (folder / name).parent != expected]:
         notes.append(f"not used: {listed(unused)}; a mask of all panoramas must be in {expected}")
-    digest = hashlib.sha256()
-    for name, image in images.items():
-        digest.update(f"{name}|{image.digest}|".encode())
-    digest.update(repr(digests).encode())
-    return Source(
-        images=images,
-        masks={name: found for name, found in zip(names, masks, strict=True) if found is not None},
-        fingerprint=digest.hexdigest(),
-        notes=tuple(notes),
-    )
+    identity = "".join(f"{name}|{image.digest}|" for name, image in images.items()) + repr(digests)
+    used = {name: found for name, found in zip(names, masks, strict=True) if found is not None}
+    return Source(images, used, hashlib.sha256(identity.encode()).hexdigest(), tuple(notes))
 
 
 def panoramas(folder: Path) -> list[str]:
     """Return the panoramas below a folder, relative to it and sorted, without masks."""
     others = (*SCENE_MASKS, OVERLAY)
-    names = [name for name in image_names(folder) if PurePosixPath(name).parts[0] not in MASK_FOLDERS]
-    return [name for name in names if PurePosixPath(name).name not in others]
+    names = [name for name in image_names(folder) if PurePosixPath(name).parts[0].lower() not in MASK_FOLDERS]
+    return [name for name in names if PurePosixPath(name).name.lower() not in others]
 
 
 def _others(folder: Path) -> tuple[str, str]:
@@ -198,4 +189,4 @@ def _others(folder: Path) -> tuple[str, str]:
 
 def mask_folder(path: Path) -> Path:
     """Return the folder that is searched for masks: that of the panoramas, or its parent if it is called images."""
-    return path.parent if path.name == "images" and image_folder(path, None) == path else path
+    return path.parent if path.name.lower() == "images" and image_folder(path, None) == path else path

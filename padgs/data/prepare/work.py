@@ -109,9 +109,8 @@ def find_result(source: Path, destination: Path, options: PrepareOptions) -> Pre
         record = json.loads((destination / PREPARED).read_text(encoding="utf-8"))
         if record["input"] != digest_of(fingerprint(source, options), options):
             return None
-        names = ("registered", "unregistered", "points", "observations")
-        registered, unregistered, *counts = (record[name] for name in names)
-        return Prepared(destination, tuple(registered), tuple(unregistered), *counts, notes=tuple(record["notes"]))
+        lists = (tuple(record[name]) for name in ("registered", "unregistered"))
+        return Prepared(destination, *lists, record["points"], record["observations"], notes=tuple(record["notes"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

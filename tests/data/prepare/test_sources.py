@@ -1,6 +1,7 @@
 """Input of `prepare`: folders of panoramas, and videos."""
 
 import errno
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,6 +60,21 @@ def test_masks_overlays_and_renders_are_not_panoramas(tmp_path):
     source = find_source(tmp_path, "auto")
     assert list(source.images) == ["a.png", "b.png"]
     assert source.notes[1:] == (f"not used: kitchen/mask.png; a mask of all panoramas must be in {tmp_path}",)
+
+
+def test_links_and_names_in_any_case_are_followed(tmp_path):
+    for name in ("there/b.png", "there/a.png", "Mask.PNG"):
+        save(tmp_path / name, 255)
+    (tmp_path / "flat").mkdir()
+    (tmp_path / "flat" / "room").symlink_to(tmp_path / "there")
+    (tmp_path / "there" / "back").symlink_to(tmp_path / "flat")
+    source = find_source(tmp_path / "flat", "auto")
+    assert list(source.images) == ["room/a.png", "room/b.png"]
+    (tmp_path / "flat").rename(tmp_path / "Images")
+    assert find_source(tmp_path, "auto").notes[0] == "mask: Mask.PNG for every view"
+    (tmp_path / "there" / "a.png").rename(tmp_path / "there" / os.fsdecode(b"k\xfcche.png"))
+    with pytest.raises(DataError, match="room/k.*che.png', which is not Unicode; rename the file"):
+        find_source(tmp_path, "auto")
 
 
 def test_ignored_files_are_reported(tmp_path):
