@@ -9,12 +9,12 @@ from padgs.cli.errors import MAX_SEED, MAX_THREADS, check_range, name_place, sho
 
 def bench(
     out: Annotated[str, typer.Option(help="folder for bench.json")] = "runs/bench",
-    quick: Annotated[bool, typer.Option(help="a few seconds on a tiny workload, to see that it works")] = False,
-    full: Annotated[bool, typer.Option(help="also 2048x1024 with a million Gaussians")] = False,
-    threads: Annotated[int, typer.Option(help="0: one per core")] = 0,
-    repeats: Annotated[int, typer.Option(help="of each measurement; 0: 10 on the CPU, 50 on a GPU")] = 0,
-    seed: Annotated[int, typer.Option(help="of the Gaussians")] = 0,
-    device: Annotated[str, typer.Option(help="cpu, or cuda")] = "cpu",
+    quick: Annotated[bool, typer.Option(help="measure a tiny workload in seconds, to see that it works")] = False,
+    full: Annotated[bool, typer.Option(help="also measure 2048x1024 with a million Gaussians")] = False,
+    threads: Annotated[int, typer.Option(help="number of threads; 0: one per core")] = 0,
+    repeats: Annotated[int, typer.Option(help="repetitions of each measurement; 0: 10 on the CPU, 50 on a GPU")] = 0,
+    seed: Annotated[int, typer.Option(help="random seed of the Gaussians")] = 0,
+    device: Annotated[str, typer.Option(help="cpu or cuda")] = "cpu",
 ) -> None:
     """Measure training and rendering, stage by stage, against the ceilings of this machine."""
     from dataclasses import replace

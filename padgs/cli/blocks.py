@@ -4,16 +4,16 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import check_range, name_place, show
+from padgs.cli.errors import Format, Mask, Split, check_range, name_place, show
 
 
 def split(
     source: Annotated[str, typer.Argument(help="folder with panoramas, poses and points")],
     blocks: Annotated[int, typer.Option(help="number of blocks")],
     to: Annotated[str, typer.Option(help="folder to write; default: SOURCE-blocks")] = "",
-    format: Annotated[str, typer.Option(help="format of the source, as data.format")] = "auto",
-    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
-    split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+    format: Format = "auto",
+    mask: Mask = "auto",
+    split: Split = "auto",
 ) -> None:
     """Divide a data set into blocks of cameras that see the same points; their images are links to those of SOURCE."""
     import shlex

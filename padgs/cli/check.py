@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.errors import show
+from padgs.cli.errors import Depth, Format, Images, Mask, Split, show
 
 if TYPE_CHECKING:
     from padgs.data.check import Report
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
-    format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
+    format: Format = "auto",
     overlay: Annotated[
         str | None, typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none")
     ] = None,
-    mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
-    depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",
-    images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
-    split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+    mask: Mask = "auto",
+    depth: Depth = "auto",
+    images: Images = "",
+    split: Split = "auto",
 ) -> None:
     """Check a data set and list its problems. Exit code 1 if there are any."""
     from rich.console import Console

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import check_range, show
+from padgs.cli.errors import Depth, Mask, Split, check_range, show
 from padgs.cli.prepare import CameraHeight, Gps, Metres
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
@@ -14,13 +14,13 @@ SOURCES = "metashape, e57, navvis, roam360, ricoh360, omniblender, ob3d, tartana
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
-    to: Annotated[str, typer.Option(help=f"the format to write: {FORMATS}")],
+    to: Annotated[str, typer.Option(help=f"format to write: {FORMATS}")],
     format: Annotated[str, typer.Option(help=f"format of the source: auto, one of these, or {SOURCES}")] = "auto",
     width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
-    points: Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of the source")] = "auto",
-    mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder")] = "auto",
-    depth: Annotated[str, typer.Option(help="auto, or none: ignore depth maps")] = "auto",
-    split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+    points: Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of starting points")] = "auto",
+    mask: Mask = "auto",
+    depth: Depth = "auto",
+    split: Split = "auto",
     metres: Metres = None,
     camera_height: CameraHeight = None,
     gps: Gps = False,

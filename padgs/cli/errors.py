@@ -15,14 +15,21 @@ from padgs.runs.interrupt import ending_by_signals
 
 Run = Annotated[str, typer.Argument(help="folder of a run, as padgs-run names it at its end")]
 Model = Annotated[str, typer.Argument(help="folder of a run, or a .ply, .compressed.ply, .spz or .sog of Gaussians")]
-Rays = Annotated[str, typer.Option(help="of a file of Gaussians: exact, or ewa as ordinary viewers draw")]
+Rays = Annotated[str, typer.Option(help="how to draw a file of Gaussians: exact, or ewa as ordinary viewers do")]
 Transform = Annotated[
-    str, typer.Option(help="4x4 matrix, 12 numbers or a file, from the file's world to the scene's; identity: as it is")
+    str, typer.Option(help="from the file's world to the scene's: 4x4 matrix, 12 numbers, a file, or identity")
 ]
 DataPath = Annotated[
     str | None,
-    typer.Option("--data", help="place of the data set: of a run if it has moved; of Gaussians, or a run on it"),
+    typer.Option("--data", help="data set, if it has moved since the run; for a file of Gaussians also a run on it"),
 ]
+Format = Annotated[str, typer.Option(help="format of the data set; auto: find out")]
+Mask = Annotated[
+    str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder; 255 marks pixels that are used")
+]
+Depth = Annotated[str, typer.Option(help="auto, or none: ignore depth maps")]
+Images = Annotated[str, typer.Option(help="image folder, if not the usual one")]
+Split = Annotated[str, typer.Option(help="how to choose held-out views: auto, files, every or all (none held out)")]
 MAX_SEED, MAX_THREADS = 2**32 - 1, max(64, 4 * (os.cpu_count() or 1))
 
 

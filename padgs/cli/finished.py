@@ -16,7 +16,7 @@ def smallest(
     data: DataPath = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
-    """Search for the smallest model as good as that of a finished run, for several losses; keep one as a run."""
+    """Search for the smallest model that is as good as that of a finished run, and keep it as a run."""
     from rich.console import Console
 
     from padgs.runs.load import load_run
@@ -33,7 +33,7 @@ def smallest(
 
 def track(
     runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
-    uri: Annotated[str, typer.Option(help="of a server or database; default: mlflow.db in RUNS")] = "",
+    uri: Annotated[str, typer.Option(help="URI of an mlflow server or database; default: mlflow.db in RUNS")] = "",
 ) -> None:
     """Mirror finished runs into mlflow, for example runs of a cluster."""
     from pathlib import Path

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from padgs.cli.errors import MAX_SEED, MAX_THREADS, check_range, show
+from padgs.cli.errors import MAX_SEED, MAX_THREADS, Mask, check_range, show
 from padgs.runs.interrupt import Interrupted
 
 if TYPE_CHECKING:
@@ -38,18 +38,18 @@ Gps = Annotated[bool, typer.Option("--gps", help="scale and turn the world by th
 def prepare(
     source: Annotated[str, typer.Argument(help="folder of panoramas, or a stitched 360-degree video")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
-    accurate: Annotated[bool, typer.Option("--accurate", help="features in undistorted views; 5x slower")] = False,
-    pairs: Annotated[str, typer.Option(help="auto, exhaustive, sequential (in order of names) or similar")] = "auto",
-    mask: Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, file or folder; 255 = use")] = "auto",
+    accurate: Annotated[bool, typer.Option("--accurate", help="find features in undistorted views; 5x slower")] = False,
+    pairs: Annotated[str, typer.Option(help="to match: auto, exhaustive, sequential (by name) or similar")] = "auto",
+    mask: Mask = "auto",
     level: Annotated[bool, typer.Option(help="turn the world so that the cameras' common up is +z")] = True,
-    per_second: Annotated[float, typer.Option(help="frames kept per second of video")] = 2.0,
-    seed: Annotated[int, typer.Option(help="of all random choices")] = 0,
-    mapper: Annotated[str, typer.Option(help="incremental, or global: place all panoramas at once")] = "incremental",
+    per_second: Annotated[float, typer.Option(help="frames to keep per second of video")] = 2.0,
+    seed: Annotated[int, typer.Option(help="random seed")] = 0,
+    mapper: Annotated[str, typer.Option(help="incremental, or global, for hundreds of panoramas")] = "incremental",
     metres: Metres = None,
     camera_height: CameraHeight = None,
     gps: Gps = False,
     threads: Annotated[
-        int, typer.Option(help="processor threads; 0 = all, at most 8, as free memory allows; fewer take less memory")
+        int, typer.Option(help="number of threads; 0: one per core, at most 8, as memory allows; fewer use less memory")
     ] = 0,
 ) -> None:
     """Find the poses of panoramas, then check the result. After an interruption, the same command continues."""

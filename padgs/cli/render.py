@@ -15,17 +15,17 @@ def render(
     path: Annotated[str, typer.Option(help="cameras, orbit, dolly, or a JSON of keyframes or nerfstudio")] = "cameras",
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
     fov: Annotated[float | None, typer.Option(help="horizontal degrees of a perspective image; default 90")] = None,
-    width: Annotated[int, typer.Option(help="pixels; 0: as the run, half of it in perspective")] = 0,
-    height: Annotated[int | None, typer.Option(help="pixels of a perspective image; default 9/16 of the width")] = None,
-    seconds: Annotated[float | None, typer.Option(help="length; default 10, or that of the camera path")] = None,
+    width: Annotated[int, typer.Option(help="width in pixels; 0: that of the run, half of it in perspective")] = 0,
+    height: Annotated[int | None, typer.Option(help="height of a perspective image; default 9/16 of the width")] = None,
+    seconds: Annotated[float | None, typer.Option(help="length of the video; default 10, or that of the path")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
     depth: Annotated[bool, typer.Option("--depth", help="also write depth")] = False,
-    npy: Annotated[bool, typer.Option("--npy", help="depth as float32 .npy, beside the PNGs of --to FOLDER")] = False,
+    npy: Annotated[bool, typer.Option("--npy", help="also write float32 depth beside the PNGs of --to FOLDER")] = False,
     data: DataPath = None,
     rays: Rays = "exact",
     transform: Transform = "",
 ) -> None:
-    """Write a video (or PNGs) along a path, as panoramas, which players recognise, or in perspective."""
+    """Write a video or PNGs along a camera path: 360-degree, which players recognise, or in perspective."""
     from pathlib import Path
 
     from rich.console import Console

@@ -20,13 +20,13 @@ def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",
     out: Annotated[str, typer.Option(help="folder of the files; default: reports in or beside RUNS")] = "",
-    protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
+    protocol: Annotated[str, typer.Option(help="rules of scoring: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
-    metric: Annotated[list[str] | None, typer.Option(help="of tables and curves, e.g. ws_psnr; repeatable")] = None,
+    metric: Annotated[list[str] | None, typer.Option(help="only these metrics, e.g. ws_psnr; repeatable")] = None,
     method: Annotated[list[str] | None, typer.Option(help="only these methods, e.g. odgs,padgs*; repeatable")] = None,
     scene: Annotated[list[str] | None, typer.Option(help="only these scenes or data sets, as a,b; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
-    mix: Annotated[bool, typer.Option(help="compare runs with different rules, sizes, lengths and machines")] = False,
+    mix: Annotated[bool, typer.Option(help="compare runs of different rules, sizes, lengths and machines")] = False,
     collect: Annotated[
         bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
     ] = False,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Rays, Transform, check_range, show
+from padgs.cli.errors import Format, Images, Mask, Rays, Split, Transform, check_range, show
 
 
 def score(
@@ -15,11 +15,11 @@ def score(
     rays: Rays = "exact",
     transform: Transform = "",
     to: Annotated[str, typer.Option(help="folder of run folders, for the result")] = "runs",
-    format: Annotated[str, typer.Option(help="of the data set; default auto")] = "",
+    format: Format = "",
     width: Annotated[int, typer.Option(help="reduce the photographs to this width; 0: as they are")] = 0,
-    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder; default auto")] = "",
-    images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
-    split: Annotated[str, typer.Option(help="auto, files, every or all; default auto")] = "",
+    mask: Mask = "",
+    images: Images = "",
+    split: Split = "",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
     """Score the test views of a data set with a model that another program made; `padgs report` shows it as a row.

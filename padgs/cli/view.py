@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def view(
     run: Model,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
-    port: Annotated[int | None, typer.Option(help="the first one to try; default 8080")] = None,
+    port: Annotated[int | None, typer.Option(help="first port to try; default 8080")] = None,
     host: Annotated[
         str | None, typer.Option(help="0.0.0.0 serves all who have the printed address; default: this machine only")
     ] = None,
@@ -26,7 +26,7 @@ def view(
     rays: Rays = "exact",
     transform: Transform = "",
 ) -> None:
-    """Walk through a run in the browser, rendered by its own renderer; a run in training is followed."""
+    """Walk through a run in the browser, also while it trains, rendered by its own renderer."""
     from padgs.apps.viewer.server import LOCAL, PORT, has_screen, serve, wait_for_checkpoint
 
     check_range(1, 65535, port=port)
