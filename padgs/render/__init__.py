@@ -32,7 +32,7 @@ __all__ = ["BACKENDS", "RenderConfig", "RenderOptions", "Rendering", "make_reque
 class RenderConfig(RenderOptions):
     """The `render` group of the configuration: `RenderOptions` with lengths relative to the scene."""
 
-    near: float = 0.01  # in `near_unit`
+    near: float = 0.01  # smallest distance that is drawn, in `near_unit`
     near_unit: str = "scene"  # scene: multiples of Scene.scale; world: world units, as the published code
     backend: str = "auto"  # a name of `BACKENDS`, or auto
 

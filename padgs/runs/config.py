@@ -37,7 +37,7 @@ class DataConfig(DataSettings):
 
     format: str = "synthetic"  # a name of padgs.data.LOADERS
     path: str | None = None  # folder of the scene; null for a generated scene
-    voxel_size: float | str = "auto"  # of anchors, as the paper states it for a dataset
+    voxel_size: float | str = "auto"  # distance of anchors, as the paper states it for a dataset
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,7 +96,7 @@ class RunOptions:
     folder: str = "runs"  # parent of the run folders
     device: str = "auto"  # auto | cpu | cuda; auto: a GPU if it can render this configuration
     jobs: int = 1  # runs at the same time on one machine: conf/launcher
-    threads: int | None = None  # of one run; null = cores / jobs
+    threads: int | None = None  # threads of one run; null = cores / jobs
     log_every: int = 10  # iterations between lines of log.jsonl
     probe_every: int = 100  # iterations between renders of one test view, the held-out PSNR of the live line
     checkpoint_every: int | None = None  # iterations between checkpoints; null = only by time
@@ -129,7 +129,7 @@ class Settings:
     stress: StressOptions = StressOptions()
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
-    seed: int = 0  # of all randomness in training, such as the order of views
+    seed: int = 0  # random seed of training, such as of the order of views
     init: WarmStart | None = None  # a finished run of the same method and scene whose model training begins with
     retry: str = "none"  # finished runs to start again: a name of RETRIES
     smallest: str = "off"  # on: search for the smallest model after the run, as padgs smallest does

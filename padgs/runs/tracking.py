@@ -39,7 +39,7 @@ class TrackingOptions:
     """The `tracking` group of the configuration; it does not affect the run id."""
 
     kind: str = "auto"  # auto | mlflow | none; auto: mlflow if it is installed
-    uri: str | None = None  # of a server or database; None = mlflow.db in run.folder
+    uri: str | None = None  # URI of a server or database; None = mlflow.db in run.folder
 
     def __post_init__(self) -> None:
         check_known(self, kind=KINDS)

@@ -70,7 +70,7 @@ class TrainOptions:
     """The `train` group of the configuration, without the run length (`Budget`)."""
 
     lambda_l1: float = 0.8  # lambda of Eq. 16
-    square_weight: float = 0.0  # of the squared error, added to the loss in the last 40 % of a run
+    square_weight: float = 0.0  # weight of the squared error, added to the loss in the last 40 % of a run
     adam_beta2: float = 0.999  # decay of Adam's second moments
     weight: str = "solid_angle"  # M of Eq. 17, see `padgs.training.loss.ROW_WEIGHTS`
     normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
@@ -84,10 +84,10 @@ class TrainOptions:
     # learned: a small correction of each training view; test views keep theirs. learned_fast: at rates of SC-OmniGS,
     # and test views follow the training views by a similarity.
     poses: str = GIVEN
-    # Of all panoramas. map: a small distortion, a free map of directions (SC-OmniGS). fisheyes_x, _y, _z: two fisheye
-    # lenses apart along an axis of the camera, stitched as one; test views have one centre (Seam360GS).
+    # Camera of all panoramas. map: a small distortion, a free map of directions (SC-OmniGS). fisheyes_x, _y, _z: two
+    # fisheye lenses apart along an axis of the camera, stitched as one; test views have one centre (Seam360GS).
     lens: str = GIVEN
-    # Of a loss on inverse range, in scene scales, in training views that have a depth map; 0: none.
+    # Weight of a loss on inverse range, in scene scales, in training views that have a depth map; 0: none.
     depth_weight: float = 0.0
     # measured: in world units, also for initial points. monocular: inverse ranges up to a scale and a shift of each
     # view, which are fitted to each render.

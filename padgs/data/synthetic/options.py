@@ -50,27 +50,27 @@ class SyntheticOptions:
 
     scene: str = "room"  # a name of `padgs.data.synthetic.SCENES`
     width: int = 512  # pixels; the height is half of it
-    train_views: int = 24  # along the path
+    train_views: int = 24  # number, along the path
     test_views: int = 6  # spread evenly between the training views along the path
     path: str | None = None  # roaming | cross | line; None = default of the scene
     path_radius: float | None = None  # metres from the middle of the path to its ends; None = default of the scene
     heading: str = "path"  # path = look along the path; fixed = along world x; random = random per view
     tilt: float = 0.0  # degrees, standard deviation of roll and of pitch per view
     samples: int = 16  # rays per pixel, a square number; stratified and jittered
-    seed: int = 0  # of path, points and noise
+    seed: int = 0  # random seed of path, points and noise
     texture_frequency: float = 1.0  # factor on the spatial frequency of all patterns
     objects: int | None = None  # number of loose objects besides the furniture; None = default of the scene
-    rooms: int | None = None  # of room_chain, with `objects` in each; None = 2
-    spokes: int = 16  # of the Siemens stars in pole_torture
+    rooms: int | None = None  # number of rooms of room_chain, with `objects` in each; None = 2
+    spokes: int = 16  # number of spokes of the Siemens stars in pole_torture
     nearest: float | None = None  # metres between the path and the objects beside it in near_clutter; None = 0.05
     horizon: float | None = None  # metres to the mountains of outdoor; None = 300
-    points: int = 20_000  # of the cloud, on surfaces that training views see
+    points: int = 20_000  # number of points, on surfaces that training views see
     point_noise: float = 0.002  # standard deviation per axis, relative to the distance from the observing camera
     outliers: float = 0.01  # share of random points that lie on no surface
     pose_noise_translation: float = 0.0  # standard deviation per axis, relative to the scene's median depth
     pose_noise_rotation: float = 0.0  # degrees, standard deviation of the angle
     lens_gap: float = 0.0  # distance of the two lenses of training views, relative to the median depth
-    lens_k1: float = 0.0  # of both lenses: theta' = theta (1 + k1 theta^2), see padgs/geometry/lens.py
+    lens_k1: float = 0.0  # distortion of both lenses: theta' = theta (1 + k1 theta^2), see padgs/geometry/lens.py
     lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are blended
     world_scale: float = 1.0  # world units per metre
     figure: bool = False  # a person walks through the scene: at another place in each training view, in no test view

@@ -40,7 +40,7 @@ class PaDGSOptions:
     omega_axis: str = "camera_y"  # axis of the latitude: camera_y | world_z
     omega_input: str = "sin2"  # network input: sin2 = Omega | cos = sqrt(1 - Omega)
     max_modulated_omega: float = 1.0  # upper limit of Omega in Eq. 15
-    distance_unit: str = "scene"  # of the distance input: scene (`Scene.scale`) | world
+    distance_unit: str = "scene"  # unit of the distance input: scene (`Scene.scale`) | world
     voxel_size: float | str = "auto"  # world units, as the paper states it per data set; auto: by `voxel_pixels`
     voxel_pixels: float = 0.1  # voxel_size=auto: pixels at the median depth; below 1 like the paper's voxels
 

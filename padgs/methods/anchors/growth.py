@@ -27,7 +27,7 @@ class GrowthOptions:
 
     statistics_from: int = 500  # statistics are collected after this iteration
     grow_from: int = 1500  # anchors are added and pruned after this iteration
-    grow_until: int = 15_000  # ... and before this one; statistics end here too
+    grow_until: int = 15_000  # anchors are added and pruned before this iteration; statistics end here too
     grow_every: int = 100  # iterations between two rounds of growth
     gradient_threshold: float = PUBLISHED_THRESHOLD / 3  # the loss is a mean over 3 channels, the published one a sum
     levels: int = 3  # number of grids, from coarse to fine

@@ -36,11 +36,11 @@ class LearningRates(ExtentOptions):
     # has about two in its `Scene.scale`.
     offset_rate: tuple[float, float] = (0.02, 0.0002)
     offset_rate_unit: str = "scene"  # scene: `Scene.scale`, independent of world units | world: as released
-    feature_rate: float = 0.0075  # of anchor features
-    log_scale_rate: float = 0.007  # of anchor scales
-    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # of the opacity network
-    color_rate: tuple[float, float] = (0.008, 5e-5)  # of the colour network
-    covariance_rate: tuple[float, float] = (0.004, 0.004)  # of the network of scales and rotations
+    feature_rate: float = 0.0075  # learning rate of anchor features
+    log_scale_rate: float = 0.007  # learning rate of anchor scales
+    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # first and last rate of the opacity network
+    color_rate: tuple[float, float] = (0.008, 5e-5)  # first and last rate of the colour network
+    covariance_rate: tuple[float, float] = (0.004, 0.004)  # rates of the network of scales and rotations
 
     def __post_init__(self) -> None:
         check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)

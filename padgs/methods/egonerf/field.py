@@ -64,14 +64,14 @@ PUBLISHED = {
 class EgoNeRFOptions:
     """The model and its training as published for Ricoh360. Lengths are in scene scales; None: published value."""
 
-    radial_nodes: int = 150  # of each chart
-    polar_nodes: int = 172  # of each chart
-    azimuth_nodes: int = 516  # of each chart
-    density_components: int = 16  # of each mode
-    appearance_components: int = 48  # of each mode
+    radial_nodes: int = 150  # radial nodes of each chart
+    polar_nodes: int = 172  # polar nodes of each chart
+    azimuth_nodes: int = 516  # azimuth nodes of each chart
+    density_components: int = 16  # components of the density for each mode
+    appearance_components: int = 48  # components of the appearance for each mode
     features: int = 27  # appearance features of the basis
     hidden: int = 128  # width of the two hidden layers
-    coarse_samples: int = 128  # of each ray
+    coarse_samples: int = 128  # samples of each ray before importance sampling
     fine_samples: int = 128  # importance samples of each ray
     min_weight: float = 0.0  # ours: samples with smaller weights are not shaded but black
     surroundings: str = "auto"  # indoor | outdoor | auto: by the cloud, see `surroundings_of`
@@ -79,11 +79,11 @@ class EgoNeRFOptions:
     distance_scale: float | None = None  # optical depth = density x scale x length
     near: float | None = None  # distance of the first sample
     far: float | None = None  # distance of the last sample
-    first_radius: float | None = None  # of the radial nodes, and the shortest interval between nodes or samples
+    first_radius: float | None = None  # radius of the first node, and shortest interval between nodes or samples
     environment: bool | None = None  # environment map as background; else black
     environment_height: int = 1920  # rows of the environment map; twice as many columns
     samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
-    rays: int = 4096  # of an iteration
+    rays: int = 4096  # rays of an iteration
     density_variation: float = 0.1  # weight of the total variation of the density planes; 0: none
     appearance_variation: float = 0.01  # weight of the total variation of the appearance planes
 

@@ -37,7 +37,7 @@ class DensificationOptions:
     """When and where Gaussians are added and removed. Iterations are those of a published run, see `for_run`."""
 
     densify_from: int = 500  # Gaussians are added and pruned after this iteration
-    densify_until: int = 15_000  # ... and before this one
+    densify_until: int = 15_000  # ... and before this iteration
     densify_every: int = 100  # iterations between two rounds
     # Gradient that is compared with the threshold. image: by the projected mean in normalised image units (3DGS).
     # space: by the mean itself, in units of half its distance to the camera (SPaGS). space_absolute: as space, and as

@@ -34,13 +34,13 @@ class SplatOptions(DensificationOptions, ExtentOptions):
     """The `method` group of the configuration: the model and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
-    initial_opacity: float = INITIAL_OPACITY  # hides what lies in front until opacities have grown
+    initial_opacity: float = INITIAL_OPACITY  # opacity of the Gaussians at the start
     initial_scale: float = 1.0  # times the distance of the nearest points; below 1 Gaussians do not overlap at first
     initial_per_pixel: float | None = None  # initial points per independent pixel of a view; None: all points
     depth_init_per_pixel: float = 0.0  # a sparser cloud is filled from training pixels by plane sweep; 0: never
     sky_per_point: float = 0.0  # directions per initial point that get a far Gaussian if no point is there
     limit_per_pixel: float | None = None  # maximal Gaussians per independent pixel, which bounds memory and time
-    means_rate_factor: float = 1.0  # on the learning rate of the means in 3DGS
+    means_rate_factor: float = 1.0  # factor on the learning rate of the means in 3DGS
     prune_psnr: float | None = None  # dB of the pruning step, see `count_for_psnr`; None: by `budget.gaussians` only
     # Variance in square pixels of the finest training view (3D smoothing filter of Mip-Splatting and SPaGS,
     # `padgs.methods.splats.smoothing_filter`); 0: none.
