@@ -23,17 +23,11 @@ LABELS = {"learning_rates": "learning rates ", "data": "data "}  # for columns w
 class Mixture(ReportError):
     """Runs of one cell or block differ in what they should share."""
 
-    def __init__(
-        self, what: str, advice: str, runs: DataFrame, columns: Sequence[str], apart_in: str = "place"
-    ) -> None:
-        """Keep the runs and the columns that differ.
+    def __init__(self, what: str, advice: str, runs: DataFrame, columns: Sequence[str], apart_in: str = "place"):
+        """Keep the runs and the columns of the frame in which they differ.
 
-        Args:
-            what: the difference in words.
-            advice: what the user can do.
-            runs: all runs concerned.
-            columns: columns of the frame in which they differ.
-            apart_in: column that can separate them: place for blocks of their own, preset for rows.
+        `what` is the difference and `advice` the way out, in words; `apart_in` is the column that can separate the
+        runs: place for blocks of their own, preset for rows.
         """
         super().__init__(f"{what}; {advice}")
         self.what, self.runs, self.columns, self.apart_in = what, runs, list(columns), apart_in
@@ -90,18 +84,17 @@ class RunSet:
         return self._made[name]
 
     def _separated(self, name: str, function: Callable[..., Any], *arguments: str) -> Any:
-        run_set, mixtures = self, dict[str, None]()
+        run_set, warnings = self, dict[str, None]()
         while True:
             try:
                 made = function(run_set, *arguments)
+                self.warnings.extend(warnings)
+                return made
             except Mixture as mixture:
                 if self.request.strict:
                     raise
-                mixtures[mixture.what] = None
+                warnings[f"{name}: {mixture.what}; they are separated, and --where chooses"] = None
                 run_set = replace(run_set, runs=separate(run_set.runs, mixture), _made={})
-                continue
-            self.warnings.extend(f"{name}: {what}; they are separated, and --where chooses" for what in mixtures)
-            return made
 
     def chosen(self, name: str) -> DataFrame:
         """Return the runs for a report: of the requested experiment, else scene by scene of the report's own
@@ -141,8 +134,11 @@ class Setting:
     @property
     def apart(self) -> list[str]:
         """Variant, if any, and changed keys."""
-        changed = [f"{key.rpartition('.')[2]} {value}" for key, value in self.changed.items()]
-        return [self.variant, *changed] if self.variant else changed
+        return [*filter(None, [self.variant]), *self.words(self.changed)]
+
+    def words(self, keys: Iterable[str]) -> list[str]:
+        """Return the names and values of some changed keys."""
+        return [f"{key.rpartition('.')[2]} {self.changed[key]}" for key in keys]
 
 
 def _is_value(stored: Any, text: str) -> bool:

@@ -69,13 +69,11 @@ def score(
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
     weight = angle_weight(image, mask, camera)
-    metrics: Metrics = {}
-    for name in protocol.metrics:
-        if camera is None:
-            metrics[name] = finite_or_none(METRICS[name](image, truth, mask))
-        else:
-            measure, by_angle = PHOTOGRAPH_METRICS.get(name), name.startswith("ws_")
-            metrics[name] = measure and finite_or_none(measure(image, truth, weight if by_angle else mask))
+    metrics: Metrics = dict.fromkeys(protocol.metrics)
+    measures = METRICS if camera is None else PHOTOGRAPH_METRICS
+    for name in metrics.keys() & measures.keys():
+        shown = weight if camera is not None and name.startswith("ws_") else mask
+        metrics[name] = finite_or_none(measures[name](image, truth, shown))
     if protocol.lpips_name is not None:
         try:
             weight = weight if protocol.solid_angle else None

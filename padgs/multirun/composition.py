@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from padgs.baselines import BUILT_IN, METHODS, distribution
+from padgs.data.perturb import CONDITIONS, NONE
 from padgs.multirun.finished import FOLDER
 from padgs.multirun.overrides import lenient, quoted, root
 from padgs.runs.config import (
@@ -26,7 +27,6 @@ from padgs.runs.config import (
     method_choices,
     method_fields,
     scene_choices,
-    stress_conditions,
 )
 from padgs.runs.console import say
 from padgs.runs.run import Method, build_method
@@ -109,7 +109,7 @@ def register_choices() -> None:
     """
     if _registered == [(root(), {**METHODS})]:
         return
-    OmegaConf.register_new_resolver("all_conditions", stress_conditions, replace=True)
+    OmegaConf.register_new_resolver("all_conditions", lambda: ",".join((NONE, *CONDITIONS)), replace=True)
     store = ConfigStore.instance()
     store.store(name="fields", node=default_fields())
     for method in [*METHODS]:

@@ -35,7 +35,7 @@ class FinishedJobs:
         self._runs, self._path = runs, runs / FOLDER / FILE_NAME
         self._known: dict[str, dict[str, Any]] = {}
         with suppress(OSError):
-            for line in self._path.read_text().splitlines():
+            for line in self._path.read_bytes().splitlines():
                 with suppress(ValueError, KeyError, TypeError):  # a damaged line only costs time
                     entry = json.loads(line)
                     self._known[entry["job"]] = entry

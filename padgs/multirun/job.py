@@ -33,22 +33,27 @@ from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
-WAITING, RUNNING, OK = "waiting", "running", "ok"
-# A job ends with a status of `padgs.results.STATUSES`, or without a result:
-REFUSED = "refused"  # the configuration or the data cannot be used; there is no run
-CRASHED = "crashed"  # by an error in the program; the traceback is in the job's output
-KILLED = "killed"  # its process died
-ELSEWHERE = "elsewhere"  # another process works on this run
-STOPPED = "stopped"  # on request, after it wrote its checkpoint
-UNFINISHED = (RUNNING, WAITING, ELSEWHERE, STOPPED)  # neither done nor failed
 SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`
+
+
+class Status:
+    """Statuses of a job, besides those of `padgs.results.STATUSES`; OK is one of them."""
+
+    WAITING, RUNNING, OK = "waiting", "running", "ok"
+    REFUSED = "refused"  # the configuration or the data cannot be used; there is no run
+    CRASHED = "crashed"  # by an error in the program; the traceback is in the job's output
+    KILLED = "killed"  # its process died
+    ELSEWHERE = "elsewhere"  # another process works on this run
+    STOPPED = "stopped"  # on request, after it wrote its checkpoint
+    EXPLAINED = (REFUSED, CRASHED, KILLED, ELSEWHERE)  # with a reason that is printed
+    UNFINISHED = (RUNNING, WAITING, ELSEWHERE, STOPPED)  # neither done nor failed
 
 
 @dataclass(frozen=True)
 class JobState:
     """State of one job."""
 
-    status: str = WAITING
+    status: str = Status.WAITING
     run: str = ""  # name of its run folder, once it is known
     reason: str = ""  # why it failed
     data: str | None = None  # folder of the data set, absolute; None for a generated scene
@@ -56,7 +61,7 @@ class JobState:
     @property
     def ended(self) -> bool:
         """True if the job does nothing more."""
-        return self.status not in (WAITING, RUNNING)
+        return self.status not in (Status.WAITING, Status.RUNNING)
 
 
 class Board:
@@ -88,9 +93,10 @@ class Board:
 
     def request_stop(self) -> None:
         """Ask running jobs to write their checkpoints and stop, and waiting jobs not to start."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / "stop").touch()
         self._stop = True
+        with suppress(OSError):  # of a full disk; jobs of the same terminal receive its signals themselves
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "stop").touch()
 
     def stop_requested(self) -> bool:
         """Return whether a stop was requested; looks at the file system at most once a second."""
@@ -108,7 +114,7 @@ class BoardEntry(Callback):
 
     def __init__(self, board: Board, number: int) -> None:
         self.data: str | None = None  # folder of the data set
-        self._board, self._number, self._state = board, number, JobState(RUNNING)
+        self._board, self._number, self._state = board, number, JobState(Status.RUNNING)
         self._board.write(number, self._state)
 
     def started(self, folder: Path) -> None:
@@ -146,15 +152,15 @@ def job_of_many(composed: DictConfig) -> str:
             search_smallest(config, scene, result, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
-            entry.end(STOPPED, str(error))
+            entry.end(Status.STOPPED, str(error))
             if alone:
-                return STOPPED
+                return Status.STOPPED
             raise
         except EXPECTED as error:
-            return entry.end(ELSEWHERE if isinstance(error, RunBusy) else REFUSED, str(error))
+            return entry.end(Status.ELSEWHERE if isinstance(error, RunBusy) else Status.REFUSED, str(error))
         except Exception as error:
             say(console, traceback.format_exc())
-            return entry.end(CRASHED, f"{type(error).__name__}: {error}")
+            return entry.end(Status.CRASHED, f"{type(error).__name__}: {error}")
 
 
 def search_smallest(config: RunConfig, scene: Scene, result: Result, console: Console, callback: Callback) -> None:

@@ -22,7 +22,7 @@ def main() -> None:
             from rich.console import Console
 
             from padgs.multirun.composition import composing, configuration, multirun
-            from padgs.multirun.job import OK, search_smallest
+            from padgs.multirun.job import Status, search_smallest
             from padgs.multirun.sweep import sweep
             from padgs.runs.console import say
             from padgs.runs.run import Callback, load_scene, run, start
@@ -40,7 +40,7 @@ def main() -> None:
                     search_smallest(config, scene, result, console, Callback())
                     tracker.add(runs / result.run)
                     ends = {result.status}
-        sys.exit(0 if ends <= {OK} else 1)
+        sys.exit(0 if ends <= {Status.OK} else 1)
 
 
 def _answer(arguments: Sequence[str]) -> None:

@@ -31,22 +31,7 @@ from rich.table import Table
 from padgs import results
 from padgs.checks import printable, typed
 from padgs.multirun.finished import FinishedJobs
-from padgs.multirun.job import (
-    CRASHED,
-    ELSEWHERE,
-    KILLED,
-    OK,
-    REFUSED,
-    RUNNING,
-    STOPPED,
-    UNFINISHED,
-    WAITING,
-    Board,
-    JobState,
-    complain,
-    in_own_process,
-    job_of_many,
-)
+from padgs.multirun.job import Board, JobState, Status, complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
 from padgs.multirun.slurm import SubmissionRefused, wait_for_jobs
 from padgs.results import Result, ResultError
@@ -129,7 +114,7 @@ class Multirun:
         except OSError as error:
             reason = str(cannot_write(self.board.folder, error))
             while waiting:
-                self._end(waiting.pop(), JobState(REFUSED, reason=reason))
+                self._end(waiting.pop(), JobState(Status.REFUSED, reason=reason))
         while waiting:
             size = 1 if self._in_process else batch_size or len(waiting)
             batch, waiting = waiting[:size], waiting[size:]
@@ -140,17 +125,17 @@ class Multirun:
             if isinstance(error, SubmissionRefused):
                 waiting, batch_size = batch + waiting, len(batch) // 2 if error.too_many else 0
                 while not batch_size and waiting:
-                    self._end(waiting.pop(0), JobState(REFUSED, reason=str(error)))
+                    self._end(waiting.pop(0), JobState(Status.REFUSED, reason=str(error)))
                 continue
             if self.board.stop_requested():
                 raise Interrupted("stopped, running jobs wrote their checkpoints")
             left = [index for index in batch if not self.states[index].ended]
-            attempts.update(index for index in left if self.states[index].status == RUNNING)
-            idle = idle + 1 if all(self.states[index].status == WAITING for index in batch) else 0
+            attempts.update(index for index in left if self.states[index].status == Status.RUNNING)
+            idle = idle + 1 if all(self.states[index].status == Status.WAITING for index in batch) else 0
             gives_up = self._in_process or idle >= IDLE_LAUNCHES
             lost = {index for index in left if gives_up or attempts[index] >= ATTEMPTS}
             for index in lost:
-                status = REFUSED if self._in_process else KILLED
+                status = Status.REFUSED if self._in_process else Status.KILLED
                 reason = f"a job ended without a status: {error or f'check the free space in {self.runs}'}"
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
@@ -167,7 +152,8 @@ class Multirun:
     def close(self) -> Counter[str]:
         """Print how the jobs ended; delete the board unless it explains a crash or jobs still need it."""
         for index, state in self.states.items():
-            if state.status == ELSEWHERE and (result := self._result(state.run)):  # the other process has finished it
+            result = self._result(state.run) if state.status == Status.ELSEWHERE else None
+            if result:  # the other process has finished it
                 self._end(index, replace(state, status=result.status))
         self._say(self.line())
         self._show_table()
@@ -179,7 +165,7 @@ class Multirun:
         alive = any(self._numbers[index] >= 0 and not state.ended for index, state in self.states.items())
         if not self._in_process and alive:  # after a second Ctrl-C: `stop` is there, and files of submitit
             self._say(f"jobs may still be running; their files and output are in {self.board.folder}")
-        elif not self._in_process and {CRASHED, KILLED} & {*counts}:
+        elif not self._in_process and {Status.CRASHED, Status.KILLED} & {*counts}:
             self._say(f"the output of crashed jobs is in {self.board.folder}")
         else:
             shutil.rmtree(self.board.folder, ignore_errors=True)
@@ -217,7 +203,7 @@ class Multirun:
 
     def _end(self, index: int, state: JobState) -> None:
         self.states[index] = state
-        if state.status in (REFUSED, CRASHED, KILLED, ELSEWHERE) and state.reason not in self._reasons:
+        if state.status in Status.EXPLAINED and state.reason not in self._reasons:
             self._reasons.add(state.reason)  # once: a missing data set is missing for all rows of a table
             complain(state.reason)
         if state.status in results.STATUSES and state.run:
@@ -257,14 +243,14 @@ def status_line(before: Counter[str], states: Collection[JobState], seconds: flo
     '3 of 6 done (2 before), 1 failed (nan), 1 running, 1 waiting, ETA 1:00'
     """
     counts = before + Counter(state.status for state in states)
-    total, done, earlier = counts.total(), counts.pop(OK, 0), before[OK]
+    total, done, earlier = counts.total(), counts.pop(Status.OK, 0), before[Status.OK]
     parts = [f"{done} of {total} done" + (f" ({earlier} before)" if earlier else "")]
-    unfinished = {name: counts.pop(name, 0) for name in UNFINISHED}
+    unfinished = {name: counts.pop(name, 0) for name in Status.UNFINISHED}
     if counts.total():
         statuses = [name if number == 1 else f"{number} {name}" for name, number in counts.most_common()]
         parts.append(f"{counts.total()} failed ({', '.join(statuses)})")
     parts += [f"{number} {name}" for name, number in unfinished.items() if number]
-    left = unfinished[RUNNING] + unfinished[WAITING]
+    left = unfinished[Status.RUNNING] + unfinished[Status.WAITING]
     ran = sum(state.status in results.STATUSES for state in states)
     if left and ran:  # all runs count alike
         parts.append(f"ETA {duration(seconds * left / ran)}")
@@ -328,7 +314,8 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
         raise SubmissionRefused(f"Slurm takes no job: {error}") from error
     if cluster == "slurm":
         for position in wait_for_jobs(submitted, board.stop_requested):
-            board.write(first_number + position, JobState(STOPPED, reason="it left the queue of Slurm before it began"))
+            left = JobState(Status.STOPPED, reason="it left the queue of Slurm before it began")
+            board.write(first_number + position, left)
         return
     for job in submitted:
         with suppress(Exception):  # a job without results died; the board tells which

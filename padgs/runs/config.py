@@ -13,7 +13,7 @@ from padgs.clock import cores
 from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
-from padgs.data.perturb import CONDITIONS, NONE, StressOptions
+from padgs.data.perturb import StressOptions
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, Protocol
 from padgs.native import cuda
@@ -254,11 +254,6 @@ def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
             yield group, {group: changes}
             defaults.append({f"override /{group}": name})
     yield "method", {"defaults": defaults}
-
-
-def stress_conditions() -> str:
-    """Return the values of a sweep over no condition and every condition."""
-    return ",".join((NONE, *CONDITIONS))
 
 
 def scene_choices() -> dict[str, dict[str, Any]]:

@@ -52,11 +52,9 @@ class Display:
 
     def __init__(self, console: Console, *, redraw: float, line: float, transient: bool = False) -> None:
         """Redraw every `redraw` seconds in a terminal, transient or not; print every `line` seconds elsewhere."""
-        self._console = console
+        self._console, self._shown = console, 0.0
         live = Live(console=console, auto_refresh=False, transient=transient) if console.is_terminal else None
-        self._live = live
-        self._interval = line if self._live is None else redraw
-        self._shown = 0.0
+        self._live, self._interval = live, line if live is None else redraw
 
     def __enter__(self: D) -> D:
         self._shown = time.monotonic()
@@ -170,16 +168,13 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
         write(console, metric_table(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
         say(console, note, "yellow")
+    timing, peak, on_gpu = result.timing, result.peak_memory_bytes, result.peak_device_memory_bytes
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
     costs.append(f"{result.model_bytes / 1e6:.1f} MB")
-    if "train_seconds" in result.timing:
-        costs.append(f"trained {duration(result.timing['train_seconds'])}")
-    if "render_ms_median" in result.timing:
-        costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
-    if result.peak_memory_bytes:  # no training was measured for models of other programs
-        costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
-    if result.peak_device_memory_bytes is not None:
-        costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
+    costs += [f"trained {duration(timing['train_seconds'])}"] if "train_seconds" in timing else []
+    costs += [f"{timing['render_ms_median']:.1f} ms per frame"] if "render_ms_median" in timing else []
+    costs += [f"peak memory {peak / 1e9:.2f} GB"] if peak else []  # not measured for models of other programs
+    costs += [] if on_gpu is None else [f"{on_gpu / 1e9:.2f} GB on the GPU"]
     say(console, ", ".join(costs))
     say(console, folder, "bold")
     if result.ok and not result.external:

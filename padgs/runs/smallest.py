@@ -150,12 +150,11 @@ class Search:
         """
         found, bend, test = self.candidates, candidates.knee(self.candidates), self.run.scene.test
         by_test = {epsilon: candidates.smallest_by_test(found, epsilon) for epsilon in SMALLEST_LOSSES}
+        metrics = evaluate(self.run.method.render, test, TEST_RULES).metrics if test else {}
         return {
             "row": self.row,
             "rows": self.rows,
-            "test_ws_psnr": evaluate(self.run.method.render, test, TEST_RULES).metrics[candidates.QUALITY]
-            if test
-            else None,
+            "test_ws_psnr": metrics.get(candidates.QUALITY),
             "minimal": {f"{e:g}": found.index(candidates.smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
             "possible": {f"{e:g}": found.index(candidates.smallest_possible(found, e)) for e in SMALLEST_LOSSES},
             "by_test": {f"{e:g}": None if one is None else found.index(one) for e, one in by_test.items()},
@@ -169,11 +168,8 @@ class Search:
     def _described(self, one: candidates.Candidate) -> dict[str, Any]:
         values, metrics, control = asdict(one), one.scores.metrics, self.candidates[0].scores
         del values["scores"]
-        values |= {
-            "loss": candidates.loss(self.candidates, one),
-            "ws_psnr": metrics[candidates.QUALITY],
-            "lpips": metrics.get(candidates.PERCEPTION),
-        }
+        values |= {"loss": candidates.loss(self.candidates, one), "ws_psnr": metrics[candidates.QUALITY]}
+        values |= {"lpips": metrics.get(candidates.PERCEPTION)}
         found = {f"{e:g}": list(candidates.objections(one.scores, control, e, self.shares)) for e in SMALLEST_LOSSES}
         return values | {"objections": found}
 

@@ -1,6 +1,6 @@
 """Charts of sweeps: each quantity over the key that was swept, a curve per scene and preset, bars over seeds."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,18 +140,16 @@ def _curves(runs: DataFrame, max_keys: int | None) -> Iterator[tuple[str, str, s
             continue
         numeric = [key for key in keys if all(is_number(setting.changed[key]) for setting in found)]
         if len(keys) > 2 or not numeric:
-            yield preset, variant, "", [(_values(setting, keys), setting) for setting in found]
+            yield preset, variant, "", [(", ".join(setting.words(keys)), setting) for setting in found]
             continue
         along = numeric[0]
         others = [key for key in keys if key != along]
-        for fixed in dict.fromkeys(_values(setting, others) for setting in found):
-            points = [(setting.changed[along], setting) for setting in found if _values(setting, others) == fixed]
-            words = ", ".join(part for part in (variant, fixed) if part)
+        by_fixed: dict[str, list[tuple[Any, Setting]]] = {}
+        for setting in found:
+            words = ", ".join(filter(None, (variant, *setting.words(others))))
+            by_fixed.setdefault(words, []).append((setting.changed[along], setting))
+        for words, points in by_fixed.items():
             yield preset, words, along, sorted(points, key=lambda point: sort_key(point[0]))
-
-
-def _values(setting: Setting, keys: Sequence[str]) -> str:
-    return ", ".join(f"{key.rpartition('.')[2]} {setting.changed[key]}" for key in keys)
 
 
 def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:

@@ -63,3 +63,10 @@ def test_a_stop_reaches_other_processes(tmp_path, monkeypatch):
     mine.request_stop()
     monkeypatch.setattr(theirs, "_looked", -float("inf"))  # a second later
     assert theirs.stop_requested()
+
+
+def test_a_stop_is_heard_by_its_own_process_even_on_a_full_disk(tmp_path):
+    (tmp_path / "taken").touch()
+    board = Board(tmp_path / "taken" / "board")
+    board.request_stop()
+    assert board.stop_requested()
