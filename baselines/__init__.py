@@ -1,7 +1,4 @@
-"""Registry of the compared methods; PaD-GS and padgs_plus are packages of `padgs.methods`.
-
-Other packages add methods by entry points, see docs/your_own_method.
-"""
+"""Registry of the compared methods; other packages add methods by entry points, see docs/your_own_method."""
 
 from importlib.metadata import entry_points
 

@@ -44,9 +44,8 @@ class OP43DGSModel(SplatModel):
 
     def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
         rendering, cap = super()._rendered(gaussians, view, **offsets), self.options.memory_cap
-        instances = 0 if cap is None else rendering.counters.get("instances", 0)
-        needed = instances * INSTANCE_BYTES
-        if cap is not None and needed > cap:
+        instances = rendering.counters.get("instances", 0) if cap else 0
+        if cap and (needed := instances * INSTANCE_BYTES) > cap:
             raise MemoryError(
                 f"{instances:,} (Gaussian, tile) instances of {INSTANCE_BYTES} bytes are {needed:,} bytes at once; "
                 f"memory_cap is {cap:,}"

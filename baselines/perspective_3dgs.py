@@ -44,9 +44,7 @@ class CutModel(SplatModel):
     def render_options(self, view: View) -> RenderOptions:
         """Return the renderer options for a view; filters of cut views keep the size of the panorama's pixels."""
         options = super().render_options(view)
-        if isinstance(view.camera, Panorama):
-            return options
-        return cut_view_options(options)
+        return options if isinstance(view.camera, Panorama) else cut_view_options(options)
 
 
 class Cubemap3DGSMethod(SplatMethod):

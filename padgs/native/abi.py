@@ -1,7 +1,4 @@
-"""The structures that the native libraries take, as in `csrc/abi.h`: plain C, pointers and sizes.
-
-Names are those of namespace padgs in `csrc/abi.h` unless a docstring says otherwise.
-"""
+"""The structures of the native libraries, named as in namespace padgs of `csrc/abi.h` unless a docstring says it."""
 
 import ctypes
 

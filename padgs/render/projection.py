@@ -227,10 +227,7 @@ def _footprints(
 
 
 def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:
-    """Return the pixels [N, 4] that can have alpha >= 1/255: `bounds=exact`, the default.
-
-    opacity exp(-q / 2) >= 1/255 is the ellipse q <= k with k = 2 ln(255 opacity); its box has half widths sqrt(k var).
-    """
+    """Return the pixels [N, 4] that can have alpha >= 1/255: the box of the ellipse q <= k = 2 ln(255 opacity)."""
     k = 2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))
     slack = 1 + 1e-4  # rounding must never cost a contribution
     half = torch.sqrt(k[:, None] * covariance[:, [0, 2]]) * slack + 1e-3

@@ -242,10 +242,7 @@ class EarlyStopping:
         return f"less than {GAIN} dB were gained within {PATIENCE:.0%} of the schedule"
 
     def _is_settled(self, psnr: float, count: int, step: int) -> bool:
-        """Add a measurement (dB) of a model with `count` parts; return whether the moving average has stopped gaining.
-
-        False while the number of parts changes: quality falls after growth and pruning before it rises.
-        """
+        """Add a measurement (dB) of `count` parts; return whether their average gains nothing, at steady counts."""
         span = round(PATIENCE / EVERY)
         averages, counts = self.state["averages"][-span:], [*self.state["counts"][-span:], count]
         averages = [*averages, averages[-1] + (psnr - averages[-1]) / span if averages else psnr]

@@ -82,9 +82,7 @@ class Trainer:
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
 
     def records(self) -> Iterator[Record]:
-        """Train to the end of the budget, yielding a record per iteration; a `Failure` ends it: nan, oom or the
-        `Monitor`'s.
-        """
+        """Train to the end of the budget, a record per iteration; a `Failure` (nan, oom, `Monitor`) ends it."""
         budget, limit = self._budget, self._budget.max_seconds
         while self.step < budget.iterations and (limit is None or self.seconds < limit):
             lap, iteration = Lap(), self.iteration + 1

@@ -103,10 +103,7 @@ def pixel_weight(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """Return the weight W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without a mask [H, W].
-
-    A ValueError says that the mask leaves no pixel.
-    """
+    """Return W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without; a mask of 0 is a ValueError."""
     if name not in ROW_WEIGHTS:
         raise ValueError(f"unknown weight {name!r}; known: {', '.join(ROW_WEIGHTS)}")
     rows = ROW_WEIGHTS[name](height, dtype=dtype, device=device)[:, None]
@@ -118,10 +115,7 @@ def pixel_weight(
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Return the structural similarity per pixel and channel, [H, W, C]; zeros outside the image, no wrap.
-
-    Variances are E[x^2] - E[x]^2 under the window.
-    """
+    """Return the structural similarity [H, W, C]; zeros outside the image, no wrap; variances are E[x^2] - E[x]^2."""
     images = torch.stack((image, image * image, image * target, target, target * target))
     mean_image, square_image, product, mean_target, square_target = window_mean(images)
     cross, squares = mean_image * mean_target, mean_image * mean_image

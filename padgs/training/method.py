@@ -1,7 +1,4 @@
-"""Method: the lifecycle under which every method is trained, timed, perturbed and compared.
-
-A method says how its model starts on a scene and how the model of a stored state is made; this class does the rest.
-"""
+"""Method: the lifecycle under which every method is trained, timed, perturbed and compared."""
 
 from __future__ import annotations
 

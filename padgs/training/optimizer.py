@@ -121,9 +121,7 @@ class Optimizer:
             self.refuse_non_finite({**parameters, **gradients}, iteration)
 
     def read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
-        """Return the loss, on a GPU only every few iterations, as the host waits; a Failure (nan) names what is not
-        finite.
-        """
+        """Return the loss, read from a GPU every few iterations only; a Failure (nan) names what is not finite."""
         if loss.device.type != "cpu" and iteration % READ_EVERY and not self.is_checked(iteration):
             return loss.detach()
         if not math.isfinite(value := loss.item()):

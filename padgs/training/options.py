@@ -98,8 +98,7 @@ class TrainOptions:
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
         check(self, "in [0, 1)", lambda decay: 0 <= decay < 1, "adam_beta2")
-        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES)
-        check_known(self, depth_kind=DEPTH_KINDS)
+        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES, depth_kind=DEPTH_KINDS)
         check(self, ">= 0 and finite", lambda weight: 0 <= weight < math.inf, "depth_weight", "square_weight")
         check_known(self, poses=(GIVEN, *POSE_RATES), lens=LENSES)
         if isinstance(self.learning_rates, str):

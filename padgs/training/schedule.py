@@ -50,7 +50,6 @@ class LogLinear:
     steps: int
 
     def __post_init__(self) -> None:
-        """Reject rates that have no logarithm."""
         if not (self.start > 0 and self.end > 0 and self.steps >= 1):
             raise ValueError(f"{self} has no log-linear decay; both rates must be > 0 and steps >= 1")
 
@@ -83,9 +82,7 @@ class Pace:
 
     @classmethod
     def of(cls, choice: str | float, iterations: int, schedule: int | None = None) -> Pace:
-        """Return the pace of `iterations`: `published`, `run`, `run_linear` or a factor; a clock has more `schedule`
-        steps.
-        """
+        """Return the pace of `iterations` by a law or factor; a clock has more `schedule` steps."""
         if choice in ("run", "run_linear"):
             is_linear = choice == "run_linear"
             factor = LINEAR_ITERATIONS / iterations if is_linear else math.sqrt(PUBLISHED_ITERATIONS / iterations)

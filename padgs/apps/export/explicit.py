@@ -168,10 +168,7 @@ def transform_splats(splats: Splats, new_from_old: Similarity) -> Splats:
 
 
 def harmonics_rotation(rotation: Tensor, degree: int) -> Tensor:
-    """Return the matrix [K, K] that rotates coefficients of spherical harmonics by a rotation [3, 3].
-
-    Rotated functions are linear combinations of the same harmonics; least squares over random directions finds them.
-    """
+    """Return the matrix [K, K] that rotates coefficients of spherical harmonics by a rotation [3, 3]."""
     directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     directions = torch.nn.functional.normalize(directions, dim=-1)
     old = harmonics.basis(directions @ rotation.double().cpu(), degree)  # R^T d, in the old world

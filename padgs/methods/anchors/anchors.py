@@ -232,10 +232,7 @@ def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
 
 
 def initial_log_scales(positions: Tensor, voxel_size: float) -> Tensor:
-    """Return initial log-scales [A, 6] of anchors [A, 3]: the log RMS distance to the three nearest neighbours.
-
-    Anchors are at least a voxel apart, so no lower limit is needed; a single anchor gets the size of a voxel.
-    """
+    """Return initial log-scales [A, 6] of anchors [A, 3]: the log RMS distance to three neighbours; a voxel for one."""
     squared = squared_spacing(positions)
     if squared is None:
         return positions.new_full((len(positions), 6), math.log(voxel_size))

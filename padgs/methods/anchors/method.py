@@ -69,10 +69,7 @@ class LearningRates(ExtentOptions):
 
 @dataclass(frozen=True)
 class AnchorRender(TrainingRender):
-    """Training render with the raw opacities of all anchors, which pruning needs.
-
-    The mean offsets may have more rows than there are Gaussians; the first N belong to them.
-    """
+    """Training render with the raw opacities of all anchors; mean offsets may have more rows than Gaussians."""
 
     raw_opacities: Tensor  # [A, K]
 
@@ -103,10 +100,7 @@ class AnchorModel:
         return self._rates.groups(self.anchors, self._extent, self._iterations)
 
     def draw(self, view: View) -> AnchorRender:
-        """Decode the anchors for the view and render them, differentiably.
-
-        On cuda the last view's capacity spares waiting for the number of Gaussians; if too small, all is repeated.
-        """
+        """Decode the anchors for the view and render them, differentiably; again if cuda had too little capacity."""
         ahead = resolve_backend(self._backend, self.anchors.positions) == "cuda"
         decoded = self.anchors.decode(view, (self._capacity if ahead else 0) or None)
         rendering, offsets = self._rendered(decoded, view)

@@ -178,10 +178,7 @@ def interval_lengths(distances: Tensor) -> Tensor:
 
 
 def refined(distances: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
-    """Return distances of fine samples [B, F]: quantiles, at shares [B, F], of the weights [B, S] of coarse samples.
-
-    Weight k lies between the midpoints around distance k of [B, S]; the outer two are ignored.
-    """
+    """Return distances of fine samples [B, F]: quantiles at shares [B, F] of the inner of coarse weights [B, S]."""
     midpoints = (distances[:, 1:] + distances[:, :-1]) / 2
     return inverse_cdf(midpoints, weights[:, 1:-1] + MIN_WEIGHT, shares)
 

@@ -107,13 +107,11 @@ class PlusOptions(SplatOptions):
         return replace(self, gradient_threshold=self.gradient_threshold * factor)
 
     def for_run(self, iterations: int) -> DensificationOptions:
-        """Return options with evenly spaced rounds up to `DENSIFIED_SHARE` of the run and no opacity resets.
-
-        Below `LONG_RUN` the threshold grows by the root of the ratio: new Gaussians take iterations to fit.
-        """
+        """Return options with evenly spaced rounds up to `DENSIFIED_SHARE` of the run and no opacity resets."""
         every = iterations_per_round(iterations)
         names = (field.name for field in fields(DensificationOptions))
         plain = DensificationOptions(**{name: getattr(self, name) for name in names})
+        # Higher in short runs, because new Gaussians take iterations to fit.
         threshold = self.gradient_threshold * max(1.0, math.sqrt(LONG_RUN / iterations))
         schedule = {"densify_from": 0, "densify_until": ROUNDS * every + 1, "densify_every": every}
         return replace(plain, gradient_threshold=threshold, reset_every=iterations + 1, **schedule)

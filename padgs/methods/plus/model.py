@@ -116,10 +116,7 @@ class PlusModel(SplatModel):
 
 
 def _hashed(seed: int, count: int, device: torch.device) -> Tensor:
-    """Return pseudo-random integers [count] below 2^32, the same on each device.
-
-    Integers from `seed` on, mixed by the finalizer of MurmurHash3: computed on the GPU, without waiting for the host.
-    """
+    """Return pseudo-random integers [count] below 2^32, the same on each device, by the finalizer of MurmurHash3."""
     mixed = torch.arange(seed, seed + count, device=device)
     for factor, shift in ((0x9E3779B1, 16), (0x85EBCA6B, 13), (0xC2B2AE35, 16)):
         mixed = mixed * factor & 0xFFFFFFFF

@@ -70,10 +70,7 @@ class DensificationOptions:
         check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_gaussians")
 
     def for_run(self, iterations: int) -> DensificationOptions:
-        """Return the options for a run of another length: each window is the same share of the run as published.
-
-        Intervals shrink too, but not below `MIN_DENSIFY_EVERY` and `MIN_RESET_EVERY`.
-        """
+        """Return the options for another length, windows as shares of it; intervals have lower limits."""
         every = scaled(self.densify_every, iterations)
         return replace(
             self,

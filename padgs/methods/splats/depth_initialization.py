@@ -41,10 +41,7 @@ MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more th
 
 
 def solid_angle_pixels(view: View) -> float:
-    """Return the independent pixels of a panorama, W H times the mean cosine 2 / pi, at least `MIN_PIXELS`.
-
-    A photograph counts as its share of a panorama with as fine pixels.
-    """
+    """Return the independent pixels of a panorama, W H 2 / pi, at least `MIN_PIXELS`; of a photograph by its share."""
     if view.sphere_share < 1:
         return 4 * math.pi * view.camera.focal**2 * view.sphere_share
     return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)

@@ -117,10 +117,7 @@ class SplatMethod(Method):
         return self._model_of(splats, options.extent_of(scene), iterations, scene.train, limit)
 
     def _filled_scene(self, scene: Scene, count: int) -> tuple[Scene, torch.Generator]:
-        """Return the scene with its cloud filled up to `count` points, and the generator of further random choices.
-
-        Computed once for a rehearsal and its run; not if the parameters come from another model.
-        """
+        """Return the scene with up to `count` points, once for rehearsal and run, and the generator of more choices."""
         generator = torch.Generator().manual_seed(self.seed)
         if count == 0 or self._loaded_state is not None or self._warm_start_state is not None:
             return scene, generator

@@ -82,10 +82,7 @@ class SplatModel:
         return [ParameterGroup(name, (rows[name],), rate) for name, rate in rates.items()]
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
-        """Render all Gaussians, differentiably.
-
-        `mean_offsets` are those of another render of the same Gaussians: their gradient is then the sum of both.
-        """
+        """Render all Gaussians, differentiably; `mean_offsets` of another render get the sum of both gradients."""
         splats, kind = self.splats, self.densifier.options.positional_gradient
         offsets = mean_offsets
         if offsets is None:
@@ -125,10 +122,7 @@ class SplatModel:
         return events
 
     def _has_enough_views(self) -> bool:
-        """Return whether the mean gradients of a round are over enough views.
-
-        If the schedule follows the clock, a round may come after few views, whose gradients are noise: it is skipped.
-        """
+        """Return whether gradients are over enough views; by the clock, a round may come after few, and is skipped."""
         if len(self.splats) == 0:  # the next render ends the run
             return False
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all

@@ -1,13 +1,9 @@
-"""The native GPU rasterizer (csrc/cuda). float32 only.
-
-Results of one device and build are bit-identical: no float is added atomically, and sorts are stable.
-"""
+"""The native GPU rasterizer (csrc/cuda), float32 only; bit-identical on a device: no atomic floats, stable sorts."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,7 +13,7 @@ from padgs.native.abi import GRADIENT_SUMS, REMOVAL, Gradients, Inputs, NativeCa
 from padgs.native.cuda import HostCopy, Queue, SortArguments, TileTable
 from padgs.render.backends import native
 from padgs.render.backends.native import TILE, NativeImage, Pixels, Strips, Upstream
-from padgs.render.contract import LazyCounters, Removals, RenderOptions
+from padgs.render.contract import LazyCounters, Removals
 
 IDENTITY = torch.eye(4)
 MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
@@ -131,25 +127,6 @@ class DeviceProjected(Strips[DeviceStrip]):
         return TileTable(self.camera.width, self.camera.height, first_row, end_row)
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """The outputs of blending, besides the pixels, that the backward pass needs."""
-
-    core_size: int  # of hybrid blending, or 0
-    last: Tensor | None = None  # [H, W] int32, sorted blending: position of the last contribution
-    core: Tensor | None = None  # [H, W, core_size] int32, hybrid blending with gradients: see csrc/cuda/core.h
-    tails: Tensor | None = None  # [H, W, 6], as core
-
-    @staticmethod
-    def allocate(options: RenderOptions, size: tuple[int, int], device: torch.device, *, differentiated: bool) -> _Kept:
-        if options.blending != "hybrid":
-            return _Kept(0, INTEGERS(size, device=device))
-        if not differentiated:
-            return _Kept(options.core_size)
-        core = INTEGERS((*size, options.core_size), device=device)
-        return _Kept(options.core_size, None, core, FLOATS(*size, 6, device=device))
-
-
 class _Image(NativeImage):
     @staticmethod
     def check(means: Tensor) -> None:
@@ -166,7 +143,12 @@ class _Image(NativeImage):
         size = (camera.height, camera.width)
         transmittance, depth = FLOATS(2, *size, device=device)
         pixels = (FLOATS(*size, 3, device=device), transmittance, depth)
-        self._kept = _Kept.allocate(options, size, device, differentiated=differentiated)
+        hybrid = options.blending == "hybrid"
+        self._core_size, keeps_core = options.core_size if hybrid else 0, hybrid and differentiated
+        # Outputs of blending for the backward pass: position of the last contribution, or cores (csrc/cuda/core.h).
+        self._last = None if hybrid else INTEGERS(size, device=device)
+        self._core = INTEGERS((*size, self._core_size), device=device) if keeps_core else None
+        self._tails = FLOATS(*size, 6, device=device) if keeps_core else None
         seen, key = native.native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
         limit = min(options.max_instances, MAX_INSTANCES)
         capacity = _capacities.get(key, 0)
@@ -188,7 +170,7 @@ class _Image(NativeImage):
         return pixels, visible
 
     def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
-        projected, device, core_size = self._projected, background.device, self._kept.core_size
+        projected, device, core_size = self._projected, background.device, self._core_size
         totals = torch.zeros(len(projected.order), GRADIENT_SUMS, dtype=torch.float32, device=device)
         core_gradients = FLOATS(*pixels[2].shape, core_size, 2, device=device) if core_size else None
         for strip in projected.strips():
@@ -247,10 +229,10 @@ class _Image(NativeImage):
         self, strip: DeviceStrip, background: Tensor, pixels: Pixels, pair_counts: Tensor | None
     ) -> cuda.BlendInputs:
         """Return the arguments of both blending passes; the tensors must outlive the call."""
-        projected, kept = self._projected, self._kept
+        projected = self._projected
         lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
-        outputs = (*pixels, kept.last, kept.core, kept.tails, pair_counts)
-        scalars = (projected.camera.projection, projected.camera.wrap, kept.core_size)
+        outputs = (*pixels, self._last, self._core, self._tails, pair_counts)
+        scalars = (projected.camera.projection, projected.camera.wrap, self._core_size)
         return cuda.BlendInputs(strip.table, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
 
 

@@ -71,10 +71,7 @@ class NativeImage(ABC):
 
     @classmethod
     def rasterize(cls, request: Request) -> Rendering:
-        """Render the request, differentiably.
-
-        OSError: no library; RuntimeError: not compiled for this GPU. `options.max_instances` makes strips smaller.
-        """
+        """Render the request, differentiably; OSError: no library, RuntimeError: not compiled for this GPU."""
         leaves = Leaves(
             **vars(request.gaussians),
             mean_offsets=request.mean_offsets,
@@ -245,10 +242,7 @@ def _of_table(make: Callable[[Tensor, torch.device], Any], table: Tensor, device
 
 
 def off_panorama(table: Tensor) -> float:
-    """Return the largest angle in radians between the rays of a table and a panorama, or -1 if it is large.
-
-    A table that is nearly a panorama has the bounds of a panorama; any other has none.
-    """
+    """Return the largest angle in radians between rays of a table and a panorama; -1 if it is large: without bounds."""
     return _of_table(_deviation, table, table.device)
 
 
