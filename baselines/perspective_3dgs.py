@@ -76,10 +76,8 @@ class Cubemap3DGSMethod(SplatMethod):
                 "render.projection=tangent or ray"
             )
         if self.train_options.weight != "uniform":
-            raise ValueError(
-                f"train.weight is {self.train_options.weight}, but the rows of perspective views have no latitude; "
-                "set uniform"
-            )
+            weight = self.train_options.weight
+            raise ValueError(f"train.weight is {weight}, but perspective views have no latitude; set uniform")
         for learned in ("exposures", "poses", "lens"):
             if (choice := getattr(self.train_options, learned)) != GIVEN:
                 raise ValueError(

@@ -11,7 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from padgs.geometry.panorama import rays
+from padgs.geometry.panorama import Device, rays
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Panorama:
     height: int
     kind: ClassVar[str] = "panorama"
 
-    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
         """Return unit directions [H, W, 3] through the pixel centres."""
         return rays(self.width, self.height, dtype=dtype, device=device)
 
@@ -44,7 +44,7 @@ class Pinhole:
     cy: float
     kind: ClassVar[str] = "pinhole"
 
-    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
         """Return unit directions [H, W, 3] through the pixel centres."""
         x = (torch.arange(self.width, dtype=dtype, device=device) + 0.5 - self.cx) / self.fx
         y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
@@ -86,7 +86,7 @@ class RayTable:
         """Return the number of rows."""
         return self.table.shape[0]
 
-    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
         """Return the table [H, W, 3]."""
         return self.table.to(device=device, dtype=dtype)
 

@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from padgs.geometry.panorama import rays, row_latitudes
+from padgs.geometry.panorama import Device, rays, row_latitudes
 
 OMEGA_AXES = ("camera_y", "world_z")
 
@@ -39,9 +39,7 @@ def distortion(directions: Tensor, axis: Tensor) -> Tensor:
     return sine * sine
 
 
-def distortion_map(
-    width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> Tensor:
+def distortion_map(width: int, height: int, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
     """Return the distortion map, Omega [H, W] at the pixel centres of a panorama."""
     polar = polar_axis("camera_y", torch.eye(4, dtype=dtype, device=device))
     return distortion(rays(width, height, dtype=dtype, device=device), polar)
@@ -59,9 +57,7 @@ def opacity_factor(omega: Tensor, tau: float, max_omega: float = 1.0) -> Tensor:
     return 1 - tau * omega.clamp(max=max_omega) if tau else torch.ones_like(omega)
 
 
-def solid_angle_weight(
-    height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> Tensor:
+def solid_angle_weight(height: int, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
     """Return the weight M = cos(latitude) > 0 of each image row, [H], at pixel centres (Eq. 17).
 
     >>> solid_angle_weight(2)
@@ -70,7 +66,7 @@ def solid_angle_weight(
     return torch.cos(row_latitudes(height, dtype=dtype, device=device))
 
 
-def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
     """Return the row weight [H] of the released code: cos(pi i / (H - 1) - pi / 2), 0 in the first and last row."""
     rows = torch.arange(height, dtype=dtype, device=device)
     return torch.cos(math.pi * rows / (height - 1) - math.pi / 2)

@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+Device = torch.device | str
 CUBIC_REACH = 2  # support of a bicubic sample in pixels
 
 
@@ -49,7 +50,7 @@ def project(points: Tensor, width: int, height: int) -> Tensor:
     return pixel_from_angles(*longitude_latitude(points), width, height)
 
 
-def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
     """Return the latitude in radians of each image row centre, [H], from nearly -pi/2 (up) to nearly +pi/2 (down).
 
     >>> row_latitudes(2) / math.pi
@@ -59,7 +60,7 @@ def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: to
     return ((rows + 0.5) / height - 0.5) * math.pi
 
 
-def rays(width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+def rays(width: int, height: int, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
     """Return unit directions [H, W, 3] in the camera frame through all pixel centres."""
     columns = torch.arange(width, dtype=dtype, device=device)
     longitude = ((columns + 0.5) / width - 0.5) * (2 * math.pi)

@@ -68,7 +68,7 @@ def render(
         mean_offsets: [N, 2] added to the projected means, in normalised image units (x and y each span 2 across the
             image, as in 3DGS). For zeros, the gradient after `backward` is the positional gradient of densification.
         absgrad: [N] zeros that change nothing; projection ray only. The gradient after `backward` is the sum over the
-            pixels of |dL/dmean| through each pixel alone, which do not cancel (`with_absgrad` of backend torch).
+            pixels of |dL/dmean| through each pixel alone, which do not cancel (`WithAbsgrad` of backend torch).
         backend: a name of `BACKENDS`, or auto: cpu or cuda, by the device, for float32 tensors if the library is built;
             torch otherwise (with one warning if the library is missing).
     """

@@ -70,13 +70,14 @@ class Trainer:
         self._views_each = views_each
         self.corrections = Corrections(scene, options)
         groups = model.groups()
-        self.corrections.to(groups[0].parameters[0].device)
+        self._device = groups[0].parameters[0].device
+        self.corrections.to(self._device)
         groups = [*groups, *self.corrections.groups(budget.iterations)]
         self._optimizer = Optimizer(groups, options.check_every, betas=(0.9, options.adam_beta2), eps=self.ADAM_EPS)
         self._early_stopping = EarlyStopping(scene.train, budget)
-        held_out, device = self._early_stopping.held_out, self._optimizer.device
+        held_out = self._early_stopping.held_out
         self._unit, depth = scene.scale, options.depth_kind if options.depth_weight > 0 else None
-        self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out, depth=depth)
+        self._views = TrainingViews(scene, options.weight, self._device, coarse_share, seed, held_out, depth=depth)
         self._order: Any = self._views  # its state decides which data the next iterations see
         pixels = sum(view.width * view.height for view in scene.train)
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)

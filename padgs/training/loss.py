@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.distortion import end_row_weight, solid_angle_weight
+from padgs.geometry.panorama import Device
 from padgs.native import cpu, cuda, library_for
 from padgs.native.abi import LossArguments, pointer
 
@@ -32,12 +33,7 @@ ROW_WEIGHTS = {
 
 
 def photometric_loss(
-    image: Tensor,
-    target: Tensor,
-    weight: Tensor,
-    lambda_l1: float = 0.8,
-    *,
-    normalisation: str = "mean",
+    image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float = 0.8, *, normalisation: str = "mean"
 ) -> Tensor:
     """Return Eq. 16, a scalar; differentiable by `image`, and by `target` if it requires a gradient.
 
@@ -96,12 +92,7 @@ def squared_error(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
 
 
 def pixel_weight(
-    name: str,
-    height: int,
-    mask: Tensor | None = None,
-    *,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
+    name: str, height: int, mask: Tensor | None = None, *, dtype: torch.dtype = torch.float32, device: Device = "cpu"
 ) -> Tensor:
     """Return W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without; a mask of 0 is a ValueError."""
     if name not in ROW_WEIGHTS:

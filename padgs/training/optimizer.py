@@ -88,11 +88,6 @@ class Optimizer:
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
         self.adam = PlainAdam(parameters, fused=True, **adam)  # fused: 2 to 3 times faster on CPUs
 
-    @property
-    def device(self) -> torch.device:
-        """Device of the parameters."""
-        return self._groups[0].parameters[0].device
-
     def parameters(self) -> dict[str, nn.Parameter]:
         """Return all parameters by their names in messages and checkpoints."""
         return {

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama, pixel_solid_angles
+from padgs.geometry.panorama import Device
 from padgs.scene import Scene, View
 from padgs.training.loss import (
     MEASURED,
@@ -65,7 +67,7 @@ class Targets:
         self,
         views: Sequence[View],
         weight: str,
-        device: torch.device | str = "cpu",
+        device: Device = "cpu",
         coarse_share: float = 0.0,
         *,
         depth: str | None = None,
@@ -76,9 +78,7 @@ class Targets:
                 "train.depth_weight is not 0, but no training view has a depth map; put depths/ beside images/"
             )
         if depth == MEASURED and any(view.depth_is_relative for view in views):
-            raise ValueError(
-                "train.depth_kind is measured, but the depth maps are relative; set train.depth_kind=monocular"
-            )
+            raise ValueError("train.depth_kind=measured, but depth maps are relative; set train.depth_kind=monocular")
         self._weight, self._device, self._coarse_share, self._depth = weight, device, coarse_share, depth
         self._weights: dict[tuple[int, int], Tensor] = {}  # by the number of halvings and the index of the view
         self._bytes_left = CACHE_BYTES
@@ -106,17 +106,17 @@ class Targets:
         return view, Target(image, weight, depth_of(view, self._device) if self._depth else None)
 
 
-def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
+def image_of(view: View, device: Device = "cpu") -> Tensor:
     """Return the image [H, W, 3] of a view, in [0, 1]; ValueError if there is none, or one of another size."""
     return _checked_size(view, "image", view.image(device=device))
 
 
-def depth_of(view: View, device: torch.device | str = "cpu") -> Tensor | None:
+def depth_of(view: View, device: Device = "cpu") -> Tensor | None:
     """Return the depth map [H, W] of a view, world units, or None; one of another size is a ValueError."""
     return None if view.load_depth is None else _checked_size(view, "depth map", view.load_depth().to(device).float())
 
 
-def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
+def weight_of(view: View, weight: str, device: Device = "cpu") -> Tensor:
     """Return the weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is in `ROW_WEIGHTS`.
 
     For other cameras than panoramas, solid_angle is that of each pixel, at most about 1, and all others are uniform.
@@ -146,18 +146,15 @@ def _checked_size(view: View, what: str, pixels: Tensor) -> Tensor:
 
 def halved(view: View) -> View:
     """Return a panorama at half the width and height, each pixel the mean of those that it covers and no mask hides."""
-    width, height, pixels, mask = view.width // 2, view.height // 2, view.load_pixels, view.load_mask
-    depth = view.load_depth
+    width, height, mask, depth = view.width // 2, view.height // 2, view.load_mask, view.load_depth
 
     def mean(image: Tensor) -> Tensor:
         return interpolate(image.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
 
-    def small_mask() -> Tensor:
-        assert mask is not None
+    def small_mask(mask: Callable[[], Tensor]) -> Tensor:
         return mean(mask()[..., None])[..., 0].contiguous()
 
-    def small_pixels() -> Tensor:
-        assert pixels is not None
+    def small_pixels(pixels: Callable[[], Tensor]) -> Tensor:
         image = pixels().float()
         small = mean(image)
         if mask is not None:
@@ -170,9 +167,9 @@ def halved(view: View) -> View:
         view,
         width=width,
         height=height,
-        load_pixels=None if pixels is None else small_pixels,
-        load_mask=None if mask is None else small_mask,
-        load_depth=None if depth is None else lambda: interpolate(depth()[None, None], (height, width))[0, 0],
+        load_pixels=view.load_pixels and partial(small_pixels, view.load_pixels),
+        load_mask=mask and partial(small_mask, mask),
+        load_depth=depth and (lambda: interpolate(depth()[None, None], (height, width))[0, 0]),
     )
 
 
@@ -187,7 +184,7 @@ class TrainingViews:
         self,
         scene: Scene,
         weight: str = "uniform",
-        device: torch.device | str = "cpu",
+        device: Device = "cpu",
         coarse_share: float = 0.0,
         seed: int = 0,
         held_out: Collection[int] = (),

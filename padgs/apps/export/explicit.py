@@ -24,7 +24,6 @@ from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
 DISTILLATION_STEPS = 300
-UNSMOOTHED = "--smooth changes nothing: the method has no 3D filter, or it is in the scales already"
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"
 
 
@@ -66,17 +65,15 @@ def export_run(
             splats = transform_splats(splats, world.inverse())
         notes.append("Gaussians as trained")
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
-            splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
+            splats, smooth = smoothed(splats, cameras_of(run.scene.train), config.low_pass), False
             notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
-        elif smooth:
-            notes.append(UNSMOOTHED)
     elif isinstance(model, AnchorModel):
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
-        if smooth:
-            notes.append(UNSMOOTHED)
     else:
         raise ValueError(f"{run.config.method} has no Gaussians to export; use padgs render or padgs view")
+    if smooth:
+        notes.append("--smooth changes nothing: the method has no 3D filter, or it is in the scales already")
     if crop is not None:
         low, high = splats.means.new_tensor(crop).view(2, 3)
         inside = ((splats.means >= low) & (splats.means <= high)).all(-1)

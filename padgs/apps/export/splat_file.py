@@ -12,7 +12,6 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -47,16 +46,13 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
         _write_ply(plain, splats, comments)
         settings = []
         if start is not None and path.suffix.lower() == ".html":
-            (folder / "viewer.json").write_text(json.dumps(_viewer_settings(start)))
+            # The world of SuperSplat's viewer is the file's rotated by 180 degrees about z.
+            position, target = (start.double() * torch.tensor([-1.0, -1.0, 1.0])).tolist()
+            camera = {"position": position, "target": target, "fov": 75, "startAnim": "none"}
+            viewer = {"camera": camera, "background": {"color": [0, 0, 0]}, "animTracks": []}
+            (folder / "viewer.json").write_text(json.dumps(viewer))
             settings = ["--viewer-settings", str(folder / "viewer.json")]
         _convert(plain, path, *settings)
-
-
-def _viewer_settings(start: Tensor) -> dict[str, Any]:
-    """Return settings of SuperSplat's viewer, whose world is the file's rotated by 180 degrees about z."""
-    position, target = (start.double() * torch.tensor([-1.0, -1.0, 1.0])).tolist()
-    camera = {"position": position, "target": target, "fov": 75, "startAnim": "none"}
-    return {"camera": camera, "background": {"color": [0, 0, 0]}, "animTracks": []}
 
 
 def _convert(source: Path, target: Path, *more: str) -> None:
@@ -100,9 +96,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
         raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
-        raise DataError(
-            f"{path} has {rest} properties f_rest_*; degrees 0 to 3 have 0, 9, 24 or 45: export one of these"
-        )
+        raise DataError(f"{path} has {rest} properties f_rest_*; degrees 0 to 3 have 0, 9, 24 or 45: export one")
 
     def columns(*wanted: str) -> torch.Tensor:  # [N, len(wanted)]
         return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))

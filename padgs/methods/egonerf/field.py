@@ -98,7 +98,14 @@ class EgoNeRFOptions:
             raise ValueError(f"{given}; they must be at least 4 and 1")
         check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
         for surroundings in PUBLISHED if self.surroundings == "auto" else (self.surroundings,):
-            _check_constants(self.constants(surroundings))
+            constants = self.constants(surroundings)
+            near, far, first_radius = constants.near, constants.far, constants.first_radius
+            if not 0 < first_radius < far - near or not near > 0:
+                raise ValueError(
+                    f"near is {near}, far {far} and first_radius {first_radius}; near and first_radius must be > 0, "
+                    "and far - near larger than first_radius"
+                )
+            check(constants, "> 0", lambda scale: scale > 0, "distance_scale")
         check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
         if self.samples_at_once < self.samples:
             raise ValueError(f"samples_at_once is {self.samples_at_once}, and a ray has {self.samples}; raise it")
@@ -119,16 +126,6 @@ class EgoNeRFOptions:
     def rays_at_once(self) -> int:
         """Rays in one pass."""
         return self.samples_at_once // self.samples
-
-
-def _check_constants(constants: Constants) -> None:
-    near, far, first_radius = constants.near, constants.far, constants.first_radius
-    if not 0 < first_radius < far - near or not near > 0:
-        raise ValueError(
-            f"near is {near}, far {far} and first_radius {first_radius}; near and first_radius must be > 0, and "
-            "far - near larger than first_radius"
-        )
-    check(constants, "> 0", lambda scale: scale > 0, "distance_scale")
 
 
 class RayColors(NamedTuple):

@@ -112,7 +112,7 @@ class RayTrainer(Trainer):
         # The model has only those members of `Model` that do not depend on views.
         super().__init__(cast(Model, model), scene, budget, options, seed, stage=stage)
         self._model, self._rays = model, rays
-        self._pixels = RayPixels(scene.train, options.weight, self._optimizer.device, seed)
+        self._pixels = RayPixels(scene.train, options.weight, self._device, seed)
         self._order = self._pixels
 
     def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int]]:

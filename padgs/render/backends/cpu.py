@@ -38,7 +38,7 @@ class Strip:
         cpu.library().padgs_bin(*gaussians, ctypes.byref(self.grid), *outputs)
 
 
-class Projected(native.Strips[Strip]):
+class Projected(native.Strips):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
     The number of instances is known before anything is allocated; above the limit, strips of tile rows are drawn.

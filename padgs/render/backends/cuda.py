@@ -75,7 +75,7 @@ class Sorter:
         return SortArguments(pointer(self.scratch), len(self.scratch), self.count, *map(pointer, buffers), bits)
 
 
-class DeviceProjected(Strips[DeviceStrip]):
+class DeviceProjected(Strips):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
     The host reads one thing back: the number of instances in each row of tiles, before memory for them is allocated.

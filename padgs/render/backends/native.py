@@ -8,7 +8,7 @@ import ctypes
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,7 +28,6 @@ SLACK = 1e-5  # radians; rounding must never cost a contribution
 CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
 MODELS = (Panorama, Pinhole, RayTable)
-StripType = TypeVar("StripType")
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
 
 
@@ -174,14 +173,13 @@ class _Rasterize(torch.autograd.Function):
         return None, None, *leaves
 
 
-class Strips(Generic[StripType]):
+class Strips:
     """Strips of tile rows of an image; a single strip is kept for the backward pass, several are made again."""
 
-    def __init__(self, make: Callable[[Any, int, int], StripType], cuts: list[int]) -> None:
-        self._make, self._cuts = make, cuts
-        self._only: StripType | None = None
+    def __init__(self, make: Callable[[Any, int, int], Any], cuts: list[int]) -> None:
+        self._make, self._cuts, self._only = make, cuts, None
 
-    def strips(self) -> Iterator[StripType]:
+    def strips(self) -> Iterator[Any]:
         """Yield the strips from top to bottom."""
         if len(self._cuts) == 2:
             if self._only is None:

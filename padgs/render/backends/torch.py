@@ -93,7 +93,7 @@ def fragments(
     """Return alpha [P, K] of K Gaussians in a given order at P pixels; 0 where nothing is drawn."""
     q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
     if absgrad is not None:
-        q = with_absgrad(q, footprints.slope(order, rows, columns), absgrad[order])
+        q = WithAbsgrad.apply(q, footprints.slope(order, rows, columns), absgrad[order])
     alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
     return torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
 
@@ -145,7 +145,7 @@ def hybrid_weights(alpha: Tensor, distance: Tensor, core_size: int) -> tuple[Ten
     return core_weights + tail * share[:, None], through * left
 
 
-def with_absgrad(q: Tensor, slope: Tensor, absgrad: Tensor) -> Tensor:
+class WithAbsgrad(torch.autograd.Function):
     """Return q; the backward pass sets the gradient of `absgrad` to the absolute positional gradient.
 
     The gradient of a mean is a sum over pixels, in which opposite gradients of a Gaussian that should be split cancel.
@@ -153,17 +153,16 @@ def with_absgrad(q: Tensor, slope: Tensor, absgrad: Tensor) -> Tensor:
     unit. AbsGS and Gaussian Opacity Fields sum absolute values of each image coordinate instead; norms do not depend on
     the axes.
     """
-    return _WithAbsgrad.apply(q, slope, absgrad)
 
-
-class _WithAbsgrad(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, q: Tensor, slope: Tensor, _absgrad: Tensor) -> Tensor:
+        """Return q."""
         ctx.save_for_backward(slope)
         return q.view_as(q)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_q: Tensor):
+        """Return the gradients of q and absgrad."""
         (slope,) = ctx.saved_tensors
         return grad_q, None, (grad_q.abs() * slope).sum(0)
