@@ -152,7 +152,7 @@ def lpips(
     pixels of the image are first replaced by those of the target. LpipsUnavailable: no weights, or too small an image.
     """
     if mask is not None:
-        image = torch.lerp(target, image, mask[..., None])
+        image = torch.lerp(target, torch.where(mask[..., None] > 0, image, target), mask[..., None])
     weight = mask if weight is None else weight
     if weight is None:
         return network(net, image.device)(image, target, inputs=inputs)

@@ -44,6 +44,7 @@ def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) ->
     """Return `ws_psnr` after fitting gain and offset of each channel to the target: the error besides exposure."""
     weight = sphere_weight(image, mask)[..., None]
     weight = weight / weight.sum()
+    image = torch.where(weight == 0, 0, image)
     means = [(of * weight).sum((0, 1)) for of in (image, target)]
     seen, true = (of - mean for of, mean in zip((image, target), means, strict=True))
     gain = (seen * true * weight).sum((0, 1)) / (seen.square() * weight).sum((0, 1)).clamp(min=FLAT)
@@ -119,8 +120,11 @@ def band_rows(height: int, band: str, *, device: torch.device | str = "cpu") -> 
 
 
 def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Return the mean of values [H, W, C] over channels and, by weight [H, W], pixels; NaN if weights sum to 0."""
-    return (values.mean(-1) * weight).sum() / weight.sum()
+    """Return the mean of values [H, W, C] over channels and, by weight [H, W], pixels; NaN if weights sum to 0.
+
+    Values without weight may be NaN.
+    """
+    return (torch.where(weight > 0, values.mean(-1), 0) * weight).sum() / weight.sum()
 
 
 def _decibel(mean_square: Tensor) -> Tensor:

@@ -135,14 +135,12 @@ def pad_panorama(image: Tensor, margin: int) -> Tensor:
     Left and right it wraps. Beyond a pole it continues down the opposite meridian: row -k is row k - 1 rolled by W / 2.
     """
     height, width = image.shape[:2]
-    if height < margin or width % 2:
-        raise ValueError(
-            f"cannot continue a {width}x{height} panorama by {margin} pixels: its width must be even and its height at "
-            f"least {margin}; resize it"
-        )
-    opposite = image.roll(width // 2, dims=1)
-    tall = torch.cat((opposite[:margin].flip(0), image, opposite[height - margin :].flip(0)))
-    return tall[:, torch.arange(-margin, width + margin, device=image.device) % width]
+    if width % 2:
+        raise ValueError(f"cannot continue a {width}x{height} panorama: its width must be even; resize it")
+    rows = torch.arange(-margin, height + margin, device=image.device)[:, None] % (2 * height)  # a whole great circle
+    beyond = rows >= height
+    columns = torch.arange(-margin, width + margin, device=image.device) + beyond * (width // 2)
+    return image[torch.where(beyond, 2 * height - 1 - rows, rows), columns % width]
 
 
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:

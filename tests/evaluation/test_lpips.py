@@ -80,8 +80,9 @@ def test_masks(weights, generator):
     mask = torch.ones(64, 128)
     mask[40:] = 0
     ruined = torch.where(mask[..., None] > 0, image, other)
-    for weight in (None, mask):
-        assert lpips(ruined, target, mask, weight=weight).item() == lpips(image, target, mask, weight=weight).item()
+    blind = torch.where(mask[..., None] > 0, image, math.nan)
+    for weight, masked in ((None, ruined), (mask, ruined), (mask, blind)):
+        assert lpips(masked, target, mask, weight=weight).item() == lpips(image, target, mask, weight=weight).item()
     uniform = lpips(image, target, weight=torch.full((64, 128), 0.3)).item()
     assert uniform == pytest.approx(weights["alex"].map(image, target).mean().item(), rel=1e-5)
     assert math.isnan(lpips(image, target, 0 * mask).item())

@@ -56,6 +56,12 @@ def test_a_constant_error_has_a_known_psnr_everywhere():
             assert metric(image, target, None).item() == pytest.approx(20.0, abs=1e-4), name  # -10 log10(0.1^2)
 
 
+@pytest.mark.parametrize("width", [2, 8])
+def test_the_smallest_panoramas_have_a_ws_ssim(width):
+    image = torch.rand(width // 2, width, 3)
+    assert ws_ssim(image, image).item() == pytest.approx(1)
+
+
 def test_constant_images_have_a_known_ssim():
     # No variance: the contrast term is 1 and luminance is (2 a b + C1) / (a^2 + b^2 + C1). True at every pixel of the
     # panorama only because windows continue across seam and poles.
@@ -147,16 +153,17 @@ def test_a_band_sees_only_its_rows(pair):
         band_rows(H, "tropics")
 
 
-@pytest.mark.parametrize("name", METRICS)
+@pytest.mark.parametrize("name", [*METRICS, "ws_psnr_fitted"])
 def test_masked_pixels_change_nothing(pair, generator, name):
     image, target = pair
     mask = ones()
     mask[-9:, :40] = 0
     mask[0, 60:] = 0
-    ruined = torch.where(mask[..., None] > 0, image, torch.rand(H, W, 3, generator=generator).double())
-    metric = METRICS[name]
+    metric = METRICS.get(name, ws_psnr_fitted)
     masked = metric(image, target, mask).item()
-    assert metric(ruined, target, mask).item() == pytest.approx(masked, abs=1e-12)
+    for other in (torch.rand(H, W, 3, generator=generator).double(), torch.full_like(image, math.nan)):
+        ruined = torch.where(mask[..., None] > 0, image, other)
+        assert metric(ruined, target, mask).item() == pytest.approx(masked, abs=1e-12)
     assert metric(image, target, ones()).item() == pytest.approx(metric(image, target, None).item(), abs=1e-12)
     assert metric(image, target, 0.5 * mask).item() == pytest.approx(masked, abs=1e-12)  # only ratios of weights count
     assert math.isnan(metric(image, target, 0 * mask).item())

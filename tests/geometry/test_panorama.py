@@ -221,7 +221,13 @@ def test_continuation_past_a_pole_is_the_opposite_meridian():
     assert padded[2].tolist() == [6, 7, 0, 1, 2, 3, 4, 5, 6, 7, 0, 1]
 
 
-@pytest.mark.parametrize("shape", [(4, 9), (1, 8)])
-def test_a_panorama_that_cannot_be_continued_is_an_error(shape):
-    with pytest.raises(ValueError, match=f"{shape[1]}x{shape[0]}.*must be even"):
-        panorama.pad_panorama(torch.zeros(*shape, 3), 2)
+def test_continuation_goes_around_the_whole_sphere():
+    columns = torch.arange(4).expand(2, 4) + 10 * torch.arange(2)[:, None]
+    rows = panorama.pad_panorama(columns, 5)[:, 5:-5]  # five rows are more than the way to the other pole
+    down, up = [columns[0].tolist(), columns[1].tolist()], [[12, 13, 10, 11], [2, 3, 0, 1]]
+    assert rows.tolist() == [up[1], *down, *up, *down, *up, *down, up[0]]
+
+
+def test_a_panorama_of_an_odd_width_cannot_be_continued():
+    with pytest.raises(ValueError, match="9x4.*must be even"):
+        panorama.pad_panorama(torch.zeros(4, 9, 3), 2)
