@@ -304,6 +304,19 @@ def test_every_rung_of_the_ladder_changes_one_thing():
     assert replace(rungs[-1].train, normalisation="mean") == paper.train
 
 
+@pytest.mark.parametrize(
+    ("settings", "setting"),
+    [
+        (("+ablation=baseline", "method=spags"), "method=spags"),
+        (("+ablation=baseline", "+sweep=omega_axis", "+experiment=ablation"), "method=padgs"),
+        (("+ablation=a6_triple_loss", "method.use_distance=false"), "method.use_distance=False"),
+    ],
+)
+def test_a_row_of_a_table_is_what_its_title_says(settings, setting):
+    with pytest.raises(ConfigError, match=rf"\{settings[0]} means .*, but {setting} was set besides"):
+        composed(*settings)
+
+
 def test_every_deviation_is_a_part_of_its_release_and_changes_something():
     found = {job.variant: job for job in jobs("+experiment=deviations")}
     assert found.keys() == variant_choices()["deviation"].keys()

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from padgs.baselines import BUILT_IN, METHODS, distribution
+from padgs.checks import ConfigError
 from padgs.data.perturb import CONDITIONS, NONE
 from padgs.multirun.finished import FOLDER
 from padgs.multirun.overrides import lenient, quoted, root
@@ -89,7 +90,27 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
         for key, value in composed.items()
         if key != "hydra"
     }
+    _refuse_changed_rows(values, choices)
     return config_from_values(values, labels(choices))
+
+
+def _refuse_changed_rows(values: Mapping[str, Any], choices: Mapping[str, object]) -> None:
+    """Refuse a row of `conf/variants` that other settings have changed, because its name and title would be wrong."""
+    for path in _variant_tables():
+        chosen = name = choices.get(path.stem)
+        rows, known = {} if chosen is None else _table(path), {}
+        while isinstance(name, str):  # a row's own settings, then those of the row that it extends
+            row = rows[name]
+            own = {f"{group}.{key}": value for group, of in row.get("set", {}).items() for key, value in of.items()}
+            known, name = {**row.get("choose", {}), **own, **known}, row.get("from")
+        for setting, value in known.items():
+            group, _, key = setting.partition(".")
+            found = values.get(group, {}).get(key) if key else choices.get(group)
+            if found != value:
+                raise ConfigError(
+                    f"+{path.stem}={chosen} means {setting}={value}, but {setting}={found} was set besides; leave out "
+                    "one of the two"
+                )
 
 
 def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:
@@ -145,8 +166,11 @@ def variant_choices() -> dict[str, dict[str, dict[str, Any]]]:
         chosen = [{f"override /{group}": choice} for group, choice in row.get("choose", {}).items()]
         return {"defaults": [*extended, *chosen], "variant": name, **row.get("set", {})}
 
-    tables = sorted((root() / "conf" / "variants").glob("*.yaml"))
-    return {path.stem: {name: node(name, row) for name, row in _table(path).items()} for path in tables}
+    return {path.stem: {name: node(name, row) for name, row in _table(path).items()} for path in _variant_tables()}
+
+
+def _variant_tables() -> list[Path]:
+    return sorted((root() / "conf" / "variants").glob("*.yaml"))
 
 
 def set_choices() -> dict[str, dict[str, dict[str, Any]]]:
