@@ -242,9 +242,14 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
         ),
         (["method=spags_sorted", "render.core_size=8"], "core_size is 8, but blending=sorted has no core"),
         (["render.near_unit=metre"], "unknown near_unit 'metre'; known: scene, world"),
+        (
+            ["method=padgs", "data=roam360", "method.voxel_pixels=3"],
+            "voxel_pixels is 3.0, but voxel_size is 0.001 world units; set voxel_size=auto or voxel_pixels=0.1",
+        ),
+        (["budget.clock=cpu"], "clock is cpu, but there are no seconds to measure; set budget.seconds"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_anything_is_read(settings, message):
+def test_what_would_have_no_effect_is_refused_before_anything_is_read(settings, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
         composed(*settings)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from padgs.baselines import METHODS
 from padgs.data.datasets import DATASETS
-from padgs.multirun.composition import composing, configuration
+from padgs.multirun.composition import composing, configuration, variant_choices
 from padgs.multirun.overrides import root
 from padgs.runs.config import DataConfig, Settings, scene_choices
 
@@ -21,7 +21,7 @@ padgs-run --cfg job           print the configuration, run nothing
 padgs-run --help method=NAME  print this text, with the keys of that method
 padgs-run --version           print the version
 """
-GROUPS = ("method", "+experiment", "+sweep", "+scene", "data", "protocol", "render", "budget", "+scale")
+GROUPS = ("method", "+experiment", "+sweep", "+scene", "data", "protocol", "render", "train", "budget", "+scale")
 GROUPS += ("launcher", "tracking")
 # The comment above a field, its name, and the comment beside it with its following lines.
 COMMENTED = re.compile(r"^((?:    # .*\n)*)    (\w+): [^#\n]*?(?:  # (.*(?:\n {5,}# .*)*))?$", re.MULTILINE)
@@ -33,9 +33,10 @@ def manual(arguments: Sequence[str], width: int | None = None) -> str:
         config = configuration([text for text in arguments if text.startswith("method=")])
     width = width or min(shutil.get_terminal_size().columns, 120)
     lines = [USAGE, "Choices:"]
-    for group in GROUPS:
+    variants = {f"+{table}": rows for table, rows in variant_choices().items()}
+    for group in (*GROUPS, *variants):
         folder = root() / ("sweeps" if group == "+sweep" else "conf") / group.lstrip("+")
-        registered = {"method": METHODS, "+scene": scene_choices()}.get(group, ())
+        registered = {"method": METHODS, "+scene": scene_choices(), **variants}.get(group, ())
         names = ", ".join(sorted({path.stem for path in folder.glob("*.yaml")} | set(map(_shortened, registered))))
         lines += textwrap.wrap(names, width, initial_indent=f"  {group}=", subsequent_indent=" " * 6)
     lines += ["", f"Keys, with their defaults under method={config.preset}:"]

@@ -80,6 +80,8 @@ class BudgetOptions:
 
     def __post_init__(self) -> None:
         Budget(1, **asdict(self))
+        if self.clock != "wall" and self.seconds is None:
+            raise ValueError(f"clock is {self.clock}, but there are no seconds to measure; set budget.seconds")
 
     def asked(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, by key."""

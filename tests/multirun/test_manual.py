@@ -21,7 +21,7 @@ def test_help_lists_every_key_with_its_default_and_meaning(root, monkeypatch):
     assert "pixels; the height is half of it" in shown["data.generator.width"] and max(map(len, lines)) <= 100
     assert "published: for 30 000" in shown["train.learning_rates"], "the comment above it"
     assert "render.projection=ray" in manual(["--help"]), "padgs+ renders by rays"
-    assert "budget=auto, given" in "\n".join(lines)
+    assert all(text in "\n".join(lines) for text in ("budget=auto, given", "train=default, released", "+ablation=a0_"))
     assert all(name in shown["+scene"] for name in ("noisy_poses", "omniblender_LOU")), "of files and of data sets"
 
 

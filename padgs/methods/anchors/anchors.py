@@ -53,6 +53,11 @@ class PaDGSOptions:
             raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
         rule = "a length > 0 in world units, or auto"
         check(self, rule, lambda size: size == "auto" or 0 < size < math.inf, "voxel_size")
+        if self.voxel_size != "auto" and self.voxel_pixels != PaDGSOptions.voxel_pixels:
+            raise ValueError(
+                f"voxel_pixels is {self.voxel_pixels}, but voxel_size is {self.voxel_size} world units; set "
+                f"voxel_size=auto or voxel_pixels={PaDGSOptions.voxel_pixels}"
+            )
 
     @property
     def inputs(self) -> int:
