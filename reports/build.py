@@ -21,7 +21,10 @@ from padgs.reports.table import Block, Cell, Column, Row, Table
 PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers add
 # No column if no run has a number
 IF_KNOWN = ("cpu_seconds", "peak_gpu_gigabytes", "sphere/abs_rel", "sphere/delta_1_25")
-SEEN_NOTE = "Tuned on: settings of methods were chosen on the scene; never seen: nobody had trained on it then."
+SEEN_NOTE = (
+    "Tuned on: settings of methods were chosen on the scene; never seen: nothing had been trained on it when they were "
+    "chosen."
+)
 RATES = {"published": "published rates", "run": "rates for the run"}
 
 

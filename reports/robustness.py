@@ -65,8 +65,7 @@ STABILITY_NOTES = (
 LIMITS_NOTES = (
     "dB: WS-PSNR without the condition less that with it, of the same seed; after a fit of colours: each view with the "
     "gain and the offset of each channel that bring it nearest to the truth. Other rows: the metric itself.",
-    "BEYOND: more than is allowed, which is for runs of a method that is meant to be robust; – in the first column: no "
-    "limit.",
+    "BEYOND: more than a method that is meant to be robust may lose; – in the first column: no limit.",
 )
 
 Stress = tuple[str, int]  # condition, level
