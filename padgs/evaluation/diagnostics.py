@@ -69,9 +69,9 @@ def floaters(depth: Tensor, alpha: Tensor, truth: Tensor) -> Tensor:
 def least_extent(depth: Tensor, truth: Tensor) -> Tensor:
     """Return the smallest standard deviation of the rendered points along any axis, relative to the true points.
 
-    Near 0 if the model has collapsed to a plane or a point; NaN if no true depth is finite.
+    Near 0 if the model has collapsed to a plane or a point; NaN if no true depth is known and finite.
     """
-    if not torch.isfinite(truth).any():
+    if not (torch.isfinite(truth) & (truth > 0)).any():
         return truth.new_tensor(torch.nan)
     thinnest = []
     directions = rays(depth.shape[1], depth.shape[0]).to(depth)

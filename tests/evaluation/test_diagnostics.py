@@ -59,7 +59,8 @@ def test_least_extent_detects_collapse():
     disc[7:9] = 2.0  # all within 11 degrees of the horizon
     assert least_extent(disc, SURFACE) < 0.1 and least_extent(0 * SURFACE, SURFACE) == 0
     assert least_extent(upper(9.0), upper(math.inf)).item() == pytest.approx(1)
-    assert least_extent(SURFACE, torch.full_like(SURFACE, math.inf)).isnan()
+    for unknown in (math.inf, 0.0):
+        assert least_extent(SURFACE, torch.full_like(SURFACE, unknown)).isnan()
 
 
 @pytest.mark.parametrize(("wrap", "sees"), [(True, False), (False, True)])
