@@ -24,6 +24,7 @@ from padgs.training.optimizer import load_rows
 
 OMEGA_INPUTS = ("sin2", "cos")
 DISTANCE_UNITS = ("scene", "world")
+MOST_CELLS = 2**53  # from the origin; float64, which rounds positions to cells, counts so far
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
 
 
@@ -47,6 +48,7 @@ class PaDGSOptions:
     def __post_init__(self) -> None:
         check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS, distance_unit=DISTANCE_UNITS)
         check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
+        check(self, "in [0, 1]", lambda limit: 0 <= limit <= 1, "max_modulated_omega")
         check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
         check(self, "> 0 and finite", lambda pixels: 0 < pixels < math.inf, "voxel_pixels")
         if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
@@ -230,8 +232,16 @@ def occupied(cells: Tensor, by: Tensor) -> Tensor:
 
 
 def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
-    """Return anchor positions [A, 3] float32: the distinct grid vertices nearest to points [P, 3], world units."""
+    """Return anchor positions [A, 3] float32: the distinct grid vertices nearest to points [P, 3], world units.
+
+    A ValueError says that the points are so many voxels away from the origin that cells are not exact.
+    """
     refuse_unusable(points, "anchors")
+    if (furthest := points.abs().max().item()) >= MOST_CELLS * voxel_size:
+        raise ValueError(
+            f"voxel_size is {voxel_size:g}, but points are {furthest:g} world units from the origin; it must be above "
+            f"{furthest / MOST_CELLS:g}: increase method.voxel_size or method.voxel_pixels"
+        )
     cells, _ = unique_cells(cells_from_points(points, voxel_size))
     return points_from_cells(cells, voxel_size)
 

@@ -32,7 +32,7 @@ class GrowthOptions:
     gradient_threshold: float = PUBLISHED_THRESHOLD / 3  # the loss is a mean over 3 channels, the published one a sum
     levels: int = 3  # number of grids, from coarse to fine
     coarsest: int = 16  # cell of the first level, in voxels
-    refinement: int = 4  # each level's cells are smaller by this factor, its threshold larger by refinement / 2
+    refinement: int = 4  # each level's cells are smaller by this factor, its threshold larger by refinement // 2
     eligible_share: float = 0.4  # a Gaussian must have been seen in more than this share of grow_every iterations
     prune_share: float = 0.8  # an anchor must have been decoded in more than this share of grow_every iterations
     min_opacity: float = 0.01  # anchors with a smaller mean sum of positive opacities are pruned
@@ -40,7 +40,9 @@ class GrowthOptions:
     max_anchors: int | None = 1_000_000  # beyond it only the places with the largest gradients get anchors
 
     def __post_init__(self) -> None:
-        if self.levels < 1 or self.refinement < 2 or self.coarsest % self.refinement ** (self.levels - 1):
+        check(self, "at least 1", lambda count: count >= 1, "levels", "coarsest")
+        check(self, "at least 2", lambda factor: factor >= 2, "refinement")
+        if self.coarsest % self.refinement ** (self.levels - 1):
             raise ValueError(
                 f"coarsest is {self.coarsest} voxels; it must be a multiple of refinement ** (levels - 1), "
                 f"here {self.refinement} ** {self.levels - 1}"

@@ -255,6 +255,7 @@ class _Decode(torch.nn.Module):
         ({"voxel_size": "small"}, "known: auto"),
         ({"tau": 1.5}, r"tau is 1.5; it must be in \[0, 1\]"),
         ({"offsets": 0}, "offsets is 0"),
+        ({"max_modulated_omega": -1.0}, "max_modulated_omega is -1.0"),
     ],
 )
 def test_invalid_options_are_refused(options, message):
@@ -321,3 +322,5 @@ def test_invalid_clouds_are_refused():
         anchors.anchors_from_points(torch.zeros(0, 3), 0.1)
     with pytest.raises(ValueError, match="point 1 of the cloud is"):
         anchors.anchors_from_points(torch.tensor([[0.0, 0, 0], [0, float("nan"), 0]]), 0.1)
+    with pytest.raises(ValueError, match="voxel_size is 1e-18, but points are 2 world units from the origin"):
+        anchors.anchors_from_points(torch.tensor([[0.0, -2, 0]]), 1e-18)

@@ -247,6 +247,7 @@ def test_max_anchors_keeps_the_largest_gradients_and_reports_it(lucky):
     ("wrong", "message"),
     [
         ({"coarsest": 10}, "coarsest is 10 voxels; it must be a multiple"),
+        ({"coarsest": 0}, "coarsest is 0; it must be at least 1"),
         ({"grow_every": 0}, "grow_every is 0"),
         ({"max_anchors": 0}, "max_anchors is 0"),
     ],
