@@ -1,0 +1,77 @@
+"""Numbers that are written by hand in the README and the page on padgs+ are those of the measured tables."""
+
+import re
+
+import pytest
+
+SCENES = {
+    **{name: f"{name} (never seen)" for name in ("basement", "plaza")},
+    "court, other path": "synthetic-outdoor-other-path (generated, never seen)",
+    **{name: f"{name} (tuned on)" for name in ("bedroom", "flat", "room")},
+}
+ROOMS = ("basement", "bedroom", "flat", "room")
+PUBLISHED = ("OP43DGS, corrected", "ODGS, corrected", "OmniGS, corrected", "SPaGS", "PaD-GS")
+TUNED = "SPaGS, sorted, options of padgs+"
+WS_PSNR, POLE, COUNT = "WS-PSNR ↑", "WS-PSNR pole ↑", "Gaussians"
+SHOWN = {  # row of docs/plus.md -> column of the table, format, factor
+    "WS-PSNR": (WS_PSNR, ".2f", 1),
+    "PSNR": ("PSNR ↑", ".2f", 1),
+    "LPIPS": (r"LPIPS VGG \[0, 1\] ↓", ".3f", 1),
+    "WS-PSNR of the polar bands": (POLE, ".2f", 1),
+    "thousands of Gaussians": (COUNT, ".0f", 1e-3),
+    "ms of a frame": ("ms per frame ↓", ".0f", 1),
+}
+
+
+def cells(line: str) -> list[str]:
+    return [re.sub(r"\*\*|</?ins>", "", cell).strip() for cell in line.split("|")[1:-1]]
+
+
+@pytest.fixture(scope="module")
+def after_a_minute(root):
+    """Scene -> method -> column -> mean, of the table after 60 s."""
+    found = {}
+    for block in (root / "reports/measured/equal_time.md").read_text().split("### ")[1:]:
+        title, _, *lines = (line for line in block.splitlines() if not line.startswith("- "))
+        head, _, *rows = (cells(line) for line in lines if line.startswith("|"))
+        means = {row[0].partition(" (n=")[0]: dict(zip(head, row, strict=True)) for row in rows}
+        found[title.partition(", 512x256, 60 s")[0]] = means
+    return lambda scene, method, column: float(found[SCENES[scene]][method][column].split()[0])
+
+
+def between(values, shown: str) -> str:
+    return f"{min(values):{shown}} to {max(values):{shown}}".replace("-", "−").replace(",", " ")
+
+
+def test_the_table_of_padgs_plus(root, after_a_minute):
+    lines = (root / "docs/plus.md").read_text().splitlines()
+    rows = {row[0]: row[1:] for row in map(cells, lines) if row}
+    heading = next(row for row in map(cells, lines) if row and "`basement`" in row)
+    assert [name.strip("`") for name in heading[1:]] == list(SCENES)
+    for title, (column, shown, factor) in SHOWN.items():
+        pairs = ([factor * after_a_minute(scene, method, column) for method in ("padgs+", TUNED)] for scene in SCENES)
+        assert rows[title] == [" / ".join(format(value, shown) for value in pair) for pair in pairs], title
+
+
+def test_the_answers_of_the_readme(root, after_a_minute):
+    of, scenes = after_a_minute, list(SCENES)
+    never = scenes[:3]
+    leads = [of(s, "padgs+", WS_PSNR) - max(of(s, method, WS_PSNR) for method in PUBLISHED) for s in scenes]
+    level = [of(s, "padgs+", WS_PSNR) - of(s, TUNED, WS_PSNR) for s in never]
+    gains, at_poles = (
+        [of(s, "PaD-GS, unmodulated", column) - of(s, "PaD-GS", column) for s in scenes] for column in (WS_PSNR, POLE)
+    )
+    less = [of(s, "padgs+", WS_PSNR) - of(s, "SPaGS", WS_PSNR) for s in ROOMS]
+    counts = [[round(of(s, method, COUNT), -3) for s in ROOMS] for method in ("padgs+", "SPaGS")]
+    others = [round(of(s, method, COUNT), -3) for s in ROOMS for method in PUBLISHED[:3]]
+    text, plus = (" ".join((root / page).read_text().split()) for page in ("README.md", "docs/plus.md"))
+    assert f"compared here by {between(leads, '.1f')} dB WS-PSNR after a minute" in plus
+    answers = [
+        f"level ({between(level, '+.1f')} dB WS-PSNR) and {min(leads[:3]):.1f} dB or more above every published method",
+        f"has {between(gains, '.1f')} dB more WS-PSNR after that minute on each of six scenes",
+        f"{between([gain for gain in at_poles if gain > 0], '.1f')} dB more at the poles of five",
+        f"{between(counts[0], ',.0f')} at 512×256 with padgs+",
+        f"SPaGS ends with {between(counts[1], ',.0f')} and {between(less, '.1f')} dB less",
+        f"OmniGS, OP43DGS and ODGS with {between(others, ',.0f')}",
+    ]
+    assert [answer for answer in answers if answer not in text] == [], "write these into the README"
