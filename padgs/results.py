@@ -329,14 +329,10 @@ def _numbers(table: dict[str, Any]) -> dict[str, Any]:
 
 def _scores(table: dict[str, Any]) -> dict[str, Scores]:
     try:
-        return {
-            name: Scores(
-                scores["protocol"],
-                _numbers(scores["metrics"]),
-                {view: _numbers(values) for view, values in scores["views"].items()},
-                tuple(scores["notes"]),
-            )
-            for name, scores in table.items()
-        }
+        found = {}
+        for name, one in table.items():
+            views = {view: _numbers(values) for view, values in one["views"].items()}
+            found[name] = Scores(one["protocol"], _numbers(one["metrics"]), views, tuple(one["notes"]))
+        return found
     except (KeyError, TypeError, AttributeError) as error:
         raise TypeError(f"scores do not have the form that this program writes ({str(table):.60})") from error

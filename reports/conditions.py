@@ -121,11 +121,9 @@ def _column(what: str, protocol: str) -> str:
 
 
 def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]:
-    """Return preset -> reason, for the presets of a block whose numbers must not be ranked.
+    """Return preset -> reason, for the presets of a block of runs whose numbers must not be ranked.
 
-    Args:
-        runs: all runs of the block.
-        equal_images: whether methods are compared after equally many images; otherwise after equal time.
+    Methods are compared after equally many images if `equal_images`; otherwise after equal time.
     """
     found: dict[str, Reason] = {}
     seen = runs.loc[runs["ok"]].groupby("preset")["images"].mean()

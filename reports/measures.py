@@ -70,11 +70,7 @@ def metric(protocol: str, name: str, group: str = "", **changes: Any) -> Measure
 
 
 def metrics(protocol: str) -> tuple[Measure, ...]:
-    """Return SSIM, PSNR and LPIPS of a protocol, or their counterparts.
-
-    Raises:
-        ReportError: no such protocol; the message lists the known ones.
-    """
+    """Return SSIM, PSNR and LPIPS of a protocol, or their counterparts; a ReportError lists the known protocols."""
     if protocol not in PROTOCOL_METRICS:
         raise ReportError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOL_METRICS)}")
     ours = {name: metric(protocol, PROTOCOL_METRICS[protocol][name], name.upper()) for name in PAPER_METRICS}
@@ -84,11 +80,7 @@ def metrics(protocol: str) -> tuple[Measure, ...]:
 
 
 def quantity(name: str, protocol: str, runs: DataFrame) -> Measure:
-    """Return a metric that runs have under a protocol, or a cost, by its name.
-
-    Raises:
-        ReportError: no such name; the message lists the known ones.
-    """
+    """Return a metric that runs have under a protocol, or a cost, by its name; a ReportError lists the known ones."""
     known = [column.removeprefix(f"{protocol}/") for column in runs if column.startswith(f"{protocol}/")]
     if name not in (*known, *COSTS):
         names = ", ".join((*known, *COSTS))

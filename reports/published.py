@@ -113,11 +113,7 @@ class Place:
 
 
 def load() -> Mapping[Key, Published]:
-    """Return all published numbers.
-
-    Raises:
-        FileNotFoundError: the file is missing from the package.
-    """
+    """Return all published numbers; a FileNotFoundError says that the file is missing from the package."""
     with FILE.open(newline="") as file:
         return {
             Key(

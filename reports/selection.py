@@ -154,11 +154,7 @@ def _is_value(stored: Any, text: str) -> bool:
 
 
 def select(runs: DataFrame, request: Request) -> DataFrame:
-    """Return the runs that a request selects.
-
-    Raises:
-        ReportError: no run has the experiment or a key of the request; the message lists the known ones.
-    """
+    """Return the runs that a request selects; if none has its experiment or a key, a ReportError lists the known."""
     every = runs
     if request.experiment:
         known = sorted(set(runs["experiments"].explode().dropna()))
@@ -223,9 +219,7 @@ def settings(runs: DataFrame) -> list[Setting]:
 def one_setting(runs: DataFrame, where: str, apart_in: str = "place") -> DataFrame:
     """Return the runs of one cell, sorted by seed; `apart_in`: see `Mixture`.
 
-    Raises:
-        Mixture: they differ in more than the seed, so that their mean would mean nothing.
-        ReportError: two runs have the same setting and seed.
+    Raises a Mixture if they differ in more than the seed, and a ReportError if two have the same setting and seed.
     """
     ordered = runs.sort_values("seed", kind="stable")
     refuse_differences(ordered, where, apart_in)
@@ -258,8 +252,7 @@ def differing_keys(runs: DataFrame) -> list[str]:
 def separate(runs: DataFrame, mixture: Mixture) -> DataFrame:
     """Return all runs, those of a mixture with their differences behind the name of the scene or preset.
 
-    Raises:
-        Mixture: the same one, if their differences have the same words.
+    Raises the mixture if their differences have the same words.
     """
     own = runs.loc[mixture.runs.index]
     words = [", ".join(of) for of in zip(*(_words(column, own[column]) for column in mixture.columns), strict=True)]

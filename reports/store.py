@@ -46,10 +46,8 @@ class Run:
 def read(source: Path) -> tuple[list[Run], list[ResultError]]:
     """Return the runs of a folder or a store in the order of their names, and an error for each unusable one.
 
-    A copy of a run is unusable beside it; the one with the shorter name of its folder counts.
-
-    Raises:
-        ResultError: the store cannot be read at all.
+    A copy of a run is unusable beside it; the one with the shorter name of its folder counts. A ResultError is raised
+    if the store cannot be read at all.
     """
     if source.is_file():
         lines = enumerate(results.file_content(source).splitlines(), start=1)
@@ -83,9 +81,7 @@ def _usable(run: Run, where: str) -> Run:
 def add(runs: Iterable[Run], store: Path) -> list[Run]:
     """Add runs to a store, replacing those of the same name but for their experiments; return all runs in it.
 
-    Raises:
-        ResultError: a line of the store is damaged, and would be lost.
-        OSError: the store cannot be written; the old one stays.
+    A ResultError says that a line of the store is damaged, and would be lost. The old store stays after an OSError.
     """
     with FileLock(store.with_name(f".{store.name}.lock"), timeout=PATIENCE):
         stored, damaged = read(store) if store.exists() else ([], [])
@@ -111,11 +107,7 @@ def render_names(folder: Path | None) -> list[str]:
 
 
 def split_image(path: Path, count: int) -> list[Image.Image]:
-    """Return `count` parts of equal width that lie side by side in an image file.
-
-    Raises:
-        OSError: the file is missing, truncated, too large, or no such image.
-    """
+    """Return `count` parts of equal width that lie side by side in an image file; an OSError says why it has none."""
     with open_image(path) as image:
         try:
             image.load()

@@ -81,11 +81,7 @@ def rendered(template: str, **values: Any) -> str:
 
 
 def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
-    """Write the files of a report, name -> content, each atomically.
-
-    Raises:
-        OSError: a file cannot be written; the old one stays.
-    """
+    """Write the files of a report, name -> content, each atomically; the old one stays after an OSError."""
     for file, content in texts.items():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / file, content)

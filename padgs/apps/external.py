@@ -287,20 +287,18 @@ def score_external(
     store = RunStore.of(config, scene)
     with store:
         store.renders.mkdir(exist_ok=True)
+        scores = score(render, scene, config.protocols, store.save_image)
+        method, measured = getattr(render, "__self__", None), dict[str, Any]()
+        if isinstance(method, ExternalMethod):
+            size = method.size()
+            measured = {"counts": {**size.counts, "parameters": size.parameters}, "model_bytes": size.bytes}
+            measured["timing"] = frame_times(render, scene)
         result = replace(
             initial_result(config, scene, store.path.name),
             iterations=1,  # the least that a result can have; none was done here
-            scores=score(render, scene, config.protocols, store.save_image),
+            scores=scores,
             finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             external={"program": program[0], "version": program[1], "label": label},
+            **measured,
         )
-        method = getattr(render, "__self__", None)
-        if isinstance(method, ExternalMethod):
-            size = method.size()
-            result = replace(
-                result,
-                counts={**size.counts, "parameters": size.parameters},
-                model_bytes=size.bytes,
-                timing=frame_times(render, scene),
-            )
         return store.finish(result), store.path

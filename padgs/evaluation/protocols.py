@@ -52,24 +52,14 @@ class Protocol:
         return max(1, math.floor(height * (1 - self.bottom_crop) + 1e-9))
 
 
+ON_THE_SPHERE = ("psnr", "ssim", "ws_psnr", "ws_ssim", *(f"ws_psnr_{band}" for band in BANDS), "seam")
+OF_FAILURES = ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam")
 PROTOCOLS = {
     # The evaluation released with the paper: flat image, LPIPS-VGG fed [0, 1].
     "paper": Protocol("paper", ("psnr", "ssim"), lpips="vgg", lpips_inputs="01", solid_angle=False),
     # Every direction has the same weight.
-    "sphere": Protocol(
-        "sphere",
-        ("psnr", "ssim", "ws_psnr", "ws_ssim", *(f"ws_psnr_{band}" for band in BANDS), "seam"),
-        lpips="alex",
-        lpips_inputs="11",
-        solid_angle=True,
-    ),
+    "sphere": Protocol("sphere", ON_THE_SPHERE, lpips="alex", lpips_inputs="11", solid_angle=True),
     # Signs of failed training; `padgs.evaluation.scoring` adds diagnostics and further scores.
-    "stability": Protocol(
-        "stability",
-        ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam"),
-        lpips="none",
-        lpips_inputs="11",
-        solid_angle=True,
-    ),
+    "stability": Protocol("stability", OF_FAILURES, lpips="none", lpips_inputs="11", solid_angle=True),
 }
 ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released evaluation cuts rows >= 959 of 1024

@@ -87,15 +87,12 @@ class Search:
         parts = [self._of_fold(count, fold, stop_requested) for fold in range(len(self.folds))]
         views = {name: metrics for part in parts for name, metrics in part["scores"]["views"].items()}
         test = [part["test_ws_psnr"] for part in parts]
-        return candidates.Candidate(
-            **parts[0]
-            | {
-                "scores": Scores({}, mean_metrics([*views.values()]), views),
-                "test_ws_psnr": None if None in test else float(np.mean(test)),
-                "seconds": math.fsum(part["seconds"] for part in parts),
-                "cpu_seconds": math.fsum(part["cpu_seconds"] for part in parts),
-            }
-        )
+        measured: dict[str, Any] = {
+            name: math.fsum(part[name] for part in parts) for name in ("seconds", "cpu_seconds")
+        }
+        measured["scores"] = Scores({}, mean_metrics([*views.values()]), views)
+        measured["test_ws_psnr"] = None if None in test else float(np.mean(test))
+        return candidates.Candidate(**parts[0] | measured)
 
     def _of_fold(self, count: int, fold: int, stop_requested: Callable[[], bool]) -> dict[str, Any]:
         """Train and measure a model of `count` rows without the views of a fold, unless an earlier search did."""

@@ -191,12 +191,8 @@ def set_axis(axis: Any, values: Sequence[float], logarithmic: bool = False, wors
 def write_labels(panel: Any, labels: Sequence[Label], marks: Sequence[tuple[float, float, float]]) -> list[Any]:
     """Write labels one after the other, each at its cheapest place, and return the texts that found one.
 
-    Positions are fractions of the figure, so its layout must be fixed, and all file formats agree.
-
-    Args:
-        panel: matplotlib axes.
-        labels: the important ones first.
-        marks: x, y (data) and radius (points) of all marks, with and without a label.
+    Positions are fractions of the figure, so its layout must be fixed, and all file formats agree. `panel`: matplotlib
+    axes; `labels`: the important ones first; `marks`: x, y (data) and radius (points), with and without a label.
     """
     figure, points = panel.figure, panel.figure.dpi / 72
     to_pixels, to_figure = panel.transData.transform, figure.transFigure.inverted().transform

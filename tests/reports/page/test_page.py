@@ -45,7 +45,10 @@ def test_the_mean_after_equal_time_is_the_first_chart():
 
 
 def test_scenes_can_be_chosen_by_set_and_by_name():
-    own = [replace(one, dataset="", scene="plaza", run=f"own{one.run}") for one in compared(["synthetic-room"], 1)]
+    own = [
+        replace(one, dataset="", scene="plaza", fingerprint="da838962d5", run=f"own{one.run}")
+        for one in compared(["synthetic-room"], 1)
+    ]
     runs = run_set([*compared(["synthetic-room", "synthetic-outdoor"], 1), *own]).runs
     sets = page._scene_sets(runs)
     assert sets["never seen"] == ["plaza"] and sets["synthetic-room"] == ["synthetic-room"]
