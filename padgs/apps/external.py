@@ -234,15 +234,15 @@ class Renders:
         """Find NAME.png for each test view NAME, where / may be a dash; a DataError names what is missing or unfit."""
         files, missing = dict[str, Path](), []
         for view in scene.test:
-            names = (f"{view.name}.png", str(Path(view.name).with_suffix(".png")), picture_name(view.name))
-            found = next((folder / name for name in names if (folder / name).is_file()), None)
-            if found is None:
-                missing.append(names[0])
-            else:
-                files[view.name] = found
+            names = (f"{view.name}.png", picture_name(view.name))
+            found = [folder / name for name in names if (folder / name).is_file()]
+            files |= {view.name: found[0]} if found else {}
+            missing += [] if found else [names[0]]
+        there = {file for file in folder.rglob("*") if file.is_file()} - {*files.values()}
         if missing:
             lost = f"{len(missing)} of {len(scene.test)} test views"
-            raise DataError(f"{folder} lacks {lost}: {listed(missing)}; render them all")
+            renames = f", or rename the files there ({listed(sorted(of.name for of in there), 3)})" if there else ""
+            raise DataError(f"{folder} lacks {lost}: {listed(missing)}; render them all{renames}")
         for view in scene.test:
             with open_image(path := files[view.name]) as image:
                 if image.size != (view.width, view.height):
@@ -253,8 +253,7 @@ class Renders:
                     )
                 if image.mode not in ("RGB", "L", "P", "1") or "transparency" in image.info:
                     raise DataError(f"{path} has pixels of type {image.mode}; save 8-bit RGB without transparency")
-        known = {*files.values()}
-        extra = tuple(str(file.relative_to(folder)) for file in sorted(folder.rglob("*.png")) if file not in known)
+        extra = tuple(str(file.relative_to(folder)) for file in sorted(there) if file.suffix == ".png")
         return cls(files, extra)
 
     def render(self, view: View) -> Rendering:

@@ -85,8 +85,11 @@ def test_suffixes_may_be_capitals(splats, tmp_path):
 def test_renders_in_a_folder_score_like_their_run(run, tmp_path):
     opened, folder = padgs.load_run(run, device="cpu"), tmp_path / "renders"
     folder.mkdir()
+    (folder / "00000.png").touch()  # as programs that number their renders
     code, output = padgs_command("score", folder, "--data", run, "--to", tmp_path)
     assert code == 1 and f"lacks 2 of 2 test views: {opened.scene.test[0].name}.png" in output
+    assert "rename the files there (00000.png)" in output
+    (folder / "00000.png").unlink()
     for view in opened.scene.test:
         Image.fromarray(to_uint8(opened.method.render(view).image)).save(folder / f"{view.name}.png")
     Image.new("RGB", (2, 1)).save(folder / "cover.png")
