@@ -53,12 +53,15 @@ class Cubemap3DGSMethod(SplatMethod):
     MODEL = CutModel
     CUT_FINENESS = FINENESS
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
-    _views_per_step = 1  # training views of an iteration, for the scene of `fit`
+    _views_per_step = 1  # cut views that cover the directions of a panorama once on average, for the scene of `fit`
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
         """Train on views cut from the panoramas; an iteration covers the sphere once."""
         cut = perspective_scene(scene, self.turns(), self.lens)
-        self._views_per_step = self._views_per_panorama(scene, cut)
+        if scene.train:  # `Method.fit` refuses others
+            lens = self.lens(Panorama(scene.train[0].width, scene.train[0].height))
+            times_seen = len(self.turns()) * solid_angle(lens) / (4 * math.pi)
+            self._views_per_step = max(1, round(len(cut.train) / len(scene.train) / times_seen))
         return super().fit(cut, budget, stage=stage)
 
     def refuse_search(self) -> None:
@@ -94,14 +97,6 @@ class Cubemap3DGSMethod(SplatMethod):
     def lens(self, panorama: Panorama) -> Pinhole:
         """Return the camera of the views; together they cover every direction once."""
         return square_lens(panorama, 1.0, FINENESS)
-
-    def _views_per_panorama(self, scene: Scene, cut: Scene) -> int:
-        """Return the number of cut views that cover the directions of a panorama once on average."""
-        if not scene.train:
-            return 1  # `Method.fit` refuses the scene
-        lens = self.lens(Panorama(scene.train[0].width, scene.train[0].height))
-        times_seen = len(self.turns()) * solid_angle(lens) / (4 * math.pi)
-        return max(1, round(len(cut.train) / len(scene.train) / times_seen))
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         """See `Method.build_trainer`."""

@@ -93,15 +93,11 @@ def write_video(
 ) -> list[Path]:
     """Render views and write them in order, one a frame; return the written videos or folders.
 
-    Args:
-        to: *.mp4, or a folder for PNGs. Files appear, and an existing video is replaced, when all frames are written.
-        scene_scale: unit of depths.
-        depth: also write depth: as colours in an .mp4 (bright is near); beside PNGs as distances along the rays, with
-            `depth.json`: unit, camera and pose of each frame in the world of the data set.
-        npy: distances as float32 in world units, not as 16 bits (`DEPTH_STEPS` per scale).
-        origin: that of the scene's coordinates in the world of the data set.
-        spherical: mark an .mp4 as a panorama.
-        progress: called with the number of written frames.
+    `to` is an .mp4, or a folder for PNGs; files appear, and an existing video is replaced, when all frames are written.
+    `depth`: also as colours in an .mp4 (bright is near), beside PNGs as distances along the rays: 16 bits,
+    `DEPTH_STEPS` per `scene_scale`, or with `npy` float32 in world units; and `depth.json`: unit, camera and pose of
+    each frame in the world of the data set, where the scene has its `origin`. `spherical`: mark an .mp4 as a panorama.
+    `progress` is called with the number of written frames.
     """
     is_mp4 = to.suffix.lower() == ".mp4"
     if to.suffix and not is_mp4 and not to.is_dir():

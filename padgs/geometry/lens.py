@@ -16,23 +16,19 @@ def axis_direction(name: str) -> Tensor:
     return torch.tensor(AXES[name], dtype=torch.float64)
 
 
-def radial_map(theta: Tensor, coefficients: Tensor) -> Tensor:
-    """Return theta' = theta (1 + k1 theta^2 + k2 theta^4 + ...), the observed angle from the axis for the angle theta.
-
-    >>> round(radial_map(torch.tensor(0.5), torch.tensor([0.1])).item(), 6)
-    0.5125
-    """
-    return theta + _excess(theta, coefficients)
-
-
 def bend(directions: Tensor, axis: Tensor, coefficients: Tensor) -> Tensor:
-    """Turn directions [..., 3] away from the axis [3] by the radial map; the identity if all coefficients are 0.
+    """Turn directions [..., 3] away from the axis [3] by the radial map; the identity if all coefficients k are 0.
 
-    d' = d cos(e) + t sin(e), e = theta' - theta and t = (d cos(theta) - a) / sin(theta); on the axis e / sin = 0.
+    The angle theta from the axis becomes theta + e, e = theta (k1 theta^2 + k2 theta^4 + ...).
+    d' = d cos(e) + t sin(e), t = (d cos(theta) - a) / sin(theta); on the axis e / sin = 0.
     """
     cosine = directions @ axis
     sine = torch.linalg.cross(directions, axis.expand_as(directions)).norm(dim=-1).clamp(min=1e-6)
-    excess = _excess(torch.atan2(sine, cosine), coefficients)
+    theta = torch.atan2(sine, cosine)
+    square, total = theta * theta, torch.zeros_like(theta)
+    for coefficient in reversed(coefficients.unbind()):  # Horner
+        total = (total + coefficient) * square
+    excess = theta * total
     away = (directions * cosine[..., None] - axis) / sine[..., None]
     return directions * torch.cos(excess)[..., None] + away * torch.sin(excess)[..., None]
 
@@ -44,11 +40,3 @@ def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
         return (height > 0).to(directions) + 0.5 * (height == 0).to(directions)
     x = (torch.asin(height.clamp(-1, 1)) / (2 * blend) + 0.5).clamp(0, 1)
     return x * x * (3 - 2 * x)
-
-
-def _excess(theta: Tensor, coefficients: Tensor) -> Tensor:
-    square = theta * theta
-    total = torch.zeros_like(theta)
-    for coefficient in reversed(coefficients.unbind()):  # Horner
-        total = (total + coefficient) * square
-    return theta * total

@@ -3,10 +3,8 @@
 Removing a Gaussian changes a pixel by dC = alpha / (1 - alpha) B - w c: its colour c with the weight w = alpha T goes,
 and B, the blend of everything behind it with the background, shows through. With the residual r = image - target the
 squared error changes by ||dC||^2 + 2 <r, dC>. This is exact, except where a pixel stops because less than 1e-4 of the
-transmittance would be left: another Gaussian may then stop it instead.
-
-Other importance scores (opacity, size, contribution, curvature of the loss) measure how visible a Gaussian is; this one
-measures the cost of its absence. A negative score is a Gaussian that increases the error.
+transmittance would be left: another Gaussian may then stop it instead. A negative score is a Gaussian that increases
+the error.
 """
 
 from collections.abc import Callable

@@ -97,10 +97,6 @@ class Monitor:
             **{"since": {}, "highest": 0.0, "first": FIRST, "halvings": None},
         }
 
-    def forget(self) -> None:
-        """Restart all signs after the schedule has jumped, because their durations are meaningless then."""
-        self.state["since"] = {}
-
     def begin(self, step: int, halvings: int, iteration: int) -> None:
         """Begin an iteration; losses are not compared with those of views that were halved more or less often."""
         state, self._step = self.state, step

@@ -163,7 +163,7 @@ class DualLens(nn.Module):
 
     Attributes:
         gap: [] distance between the optical centres, scene units; positive: each lens is on its own side.
-        coefficients: [2, K] of `padgs.geometry.lens.radial_map`, for the lens along the axis and the other.
+        coefficients: [2, K] of `padgs.geometry.lens.bend`, for the lens along the axis and the other.
         axis: [3] float64 of the first lens, camera frame.
         blend: radians, half width of the band in which both lenses are seen.
         scene_scale: `Scene.scale`, world units.

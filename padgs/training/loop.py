@@ -118,7 +118,7 @@ class Trainer:
             return False
         self.skipped, self.step, self.ended = self._early_stopping.fade - self.step, self._early_stopping.fade, reason
         self._views.include_held_out()
-        self._monitor.forget()
+        self._monitor.state["since"] = {}  # durations of signs mean nothing after the schedule has jumped
         return True
 
     @property

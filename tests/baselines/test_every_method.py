@@ -15,6 +15,7 @@ from support.states import assert_same_but_time
 
 from padgs.baselines import BUILT_IN, METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
+from padgs.methods.egonerf.model import RATES
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
 from padgs.runs.run import build_method
@@ -46,7 +47,8 @@ def scenes(tmp_path_factory) -> Iterator[Callable[[str], Scene]]:
     """The synthetic scenes by their names, tiny."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr("padgs.methods.egonerf.model.GRID_RATE", 0.1)  # twenty steps shall show something
+        for grid in ("density", "appearance"):
+            patch.setitem(RATES, grid, 0.1)  # twenty steps shall show something
         yield cache(
             lambda name: generate(SyntheticOptions(name, WIDTH, train_views=3, test_views=1, samples=1, points=200))
         )

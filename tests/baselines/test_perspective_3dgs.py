@@ -93,7 +93,7 @@ def test_learns_whole_panoramas_from_their_parts(name):
 
 @each_method
 def test_a_weight_of_latitudes_is_refused(name):
-    with pytest.raises(ValueError, match="train.weight is solid_angle, but the rows of perspective views"):
+    with pytest.raises(ValueError, match="train.weight is solid_angle, but perspective views have no latitude"):
         METHOD[name](train=TrainOptions(weight="solid_angle"))
 
 

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from padgs.geometry.lens import AXES, axis_direction, bend, hemisphere_weight, radial_map
+from padgs.geometry.lens import AXES, axis_direction, bend, hemisphere_weight
 from padgs.geometry.panorama import rays
 
 K = torch.tensor([0.03, -0.004], dtype=torch.float64)
@@ -12,6 +12,10 @@ K = torch.tensor([0.03, -0.004], dtype=torch.float64)
 def angle_from(axis: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     aside = torch.linalg.cross(directions, axis.expand_as(directions)).norm(dim=-1)
     return torch.atan2(aside, directions @ axis)
+
+
+def radial_map(theta: torch.Tensor, k: torch.Tensor) -> torch.Tensor:
+    return theta * (1 + k[0] * theta**2 + k[1] * theta**4)
 
 
 @pytest.mark.parametrize("name", AXES)

@@ -60,7 +60,7 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
     """
     count = len(model) * model.options.offsets
     zeros = model.positions.new_zeros
-    contribution, visible, opacity, covariance = zeros(count), zeros(count), zeros(count), zeros(count, 9)
+    contribution, visible, covariance = zeros(count), zeros(count), zeros(count, 9)
     size = (FITTED_DEGREE + 1) ** 2
     normal, colour = zeros(count, size, size), zeros(count, size, 3)
     for view in views:
@@ -70,7 +70,6 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
         contribution.index_add_(0, slots, pixels)
         within = pixels / drawn.opacities  # visible area of the footprint, in pixels
         visible.index_add_(0, slots, within)
-        opacity.index_add_(0, slots, pixels)
         axes = rotation_matrices(drawn.quats) * drawn.scales[:, None]
         covariance.index_add_(0, slots, within[:, None] * (axes @ axes.mT).flatten(1))
         directions = torch.nn.functional.normalize(drawn.means - view.center.to(drawn.means), dim=-1)
@@ -83,7 +82,7 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
     ridge[0, 0] = 0
     coefficients = torch.linalg.solve(normal[keep] + contribution[keep, None, None] * ridge, colour[keep])
     scales, quats = axes_of((covariance[keep] / visible[keep, None]).view(-1, 3, 3))
-    opacities = (opacity[keep] / visible[keep]).clamp(1 / 255, MAX_OPACITY)
+    opacities = (contribution[keep] / visible[keep]).clamp(1 / 255, MAX_OPACITY)
     blank = Splats(zeros(0, 3), zeros(0, 3), zeros(0, 3), degree=DEGREE, scene_scale=unit)
     rest = zeros(len(keep), (DEGREE + 1) ** 2 - 1, 3)
     rest[:, : size - 1] = coefficients[:, 1:]

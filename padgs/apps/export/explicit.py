@@ -47,14 +47,10 @@ def export_run(
 ) -> Exported:
     """Convert a run of any method with Gaussians to explicit ones, in the world of its scene.
 
-    Args:
-        run: whose data set is needed, unless the Gaussians are written as trained.
-        distillation_steps: iterations in which baked anchors are trained on renders of the run.
-        upright: rotate the world so that the cameras' up is -y, as viewers expect.
-        smooth: include the 3D filter (`padgs.methods.splats.smoothing_filter`) in the scales, if there is one;
-            viewers have no such filter, and show sharp Gaussians as needles.
-        crop: lowest and highest x y z; Gaussians with their mean outside are left out.
-        progress: called with the number of completed distillation steps.
+    Its data set is needed, unless the Gaussians are written as trained. Baked anchors are trained on renders of the run
+    for `distillation_steps`, which `progress` is told. `upright` rotates the world so that the cameras' up is -y, as
+    viewers expect; `smooth` includes the 3D filter (`padgs.methods.splats.smoothing_filter`) in the scales, if there is
+    one, as viewers have none; `crop` are lowest and highest x y z of the means that are kept.
     """
     model = run.method.model
     config = run.config.render

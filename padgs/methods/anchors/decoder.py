@@ -57,14 +57,11 @@ class SeenAnchors(NamedTuple):
 def decode_gaussians(
     weights: DecoderWeights, anchors: SeenAnchors, capacity: int | None = None
 ) -> tuple[Gaussians, Tensor, Tensor, Tensor | None]:
-    """Return the selected Gaussians of all anchors (Eq. 13-15).
+    """Return the N selected Gaussians in the order of their slots, slots, raw opacities, and N [1] or None (Eq. 13-15).
 
-    Differentiable by weights, features, offsets and log-scales. `capacity`: on a GPU with the library, a number of
-    rows, so that the host need not wait for N: the selected Gaussians up to it, then zeros, which are culled.
-
-    Returns:
-        N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient;
-        with a capacity N, [1] int64, else None.
+    Slots [N] int64 are anchor K + k, raw opacities [A, K] have no gradient; else it is differentiable by weights,
+    features, offsets and log-scales. `capacity`: on a GPU with the library, a number of rows, so that the host need not
+    wait for N, which is returned: the selected Gaussians up to it, then zeros, which are culled.
     """
     library = library_for(anchors.features)
     if library is None:
@@ -111,9 +108,8 @@ class Decoder(nn.Module):
     ) -> None:
         """Build networks from `inputs` values per anchor to `offsets` Gaussians, with one hidden layer."""
         super().__init__()
-        self.opacity = _layers(inputs, hidden, OPACITY_VALUES * offsets, generator)
-        self.color = _layers(inputs, hidden, COLOR_VALUES * offsets, generator)
-        self.covariance = _layers(inputs, hidden, COVARIANCE_VALUES * offsets, generator)
+        values = (OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES)
+        self.opacity, self.color, self.covariance = (_layers(inputs, hidden, n * offsets, generator) for n in values)
 
     def weights(self) -> DecoderWeights:
         """Return the weights as `decode` takes them."""

@@ -134,11 +134,11 @@ def grid_position(points: Tensor, nodes: Tensor) -> GridPosition:
 
 def products(factors: Factors, at: GridPosition) -> list[Tensor]:
     """Return plane x line at N positions, [C, N] for each mode."""
-    found = []
-    for (axes, along), plane, line in zip(MODES, factors.planes, factors.lines, strict=True):
-        on_plane = _look_up(plane, at.chart, getattr(at, axes[0]), getattr(at, axes[1]))
-        found.append(on_plane * _look_up(line[..., None], at.chart, getattr(at, along), None))
-    return found
+    return [
+        _look_up(plane, at.chart, getattr(at, axes[0]), getattr(at, axes[1]))
+        * _look_up(line[..., None], at.chart, getattr(at, along), None)
+        for (axes, along), plane, line in zip(MODES, factors.planes, factors.lines, strict=True)
+    ]
 
 
 def density_feature(factors: Factors, at: GridPosition) -> Tensor:

@@ -18,7 +18,7 @@ from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import LogLinear, ParameterGroup
 from padgs.training.targets import image_of, weight_of
 
-GRID_RATE, NETWORK_RATE, ENVIRONMENT_RATE = 0.02, 1e-3, 5e-3  # learning rates of Adam at the start
+RATES = {"density": 0.02, "appearance": 0.02, "shader": 1e-3, "environment": 5e-3}  # of Adam at the start
 RATE_DECAY = 0.1  # rates and weights of the total variation decay exponentially to this share
 VARIATION_FACTOR = 1e-2  # published, on both weights of the total variation
 
@@ -32,16 +32,10 @@ class EgoNeRFModel:
 
     def groups(self) -> list[ParameterGroup]:
         """Return all parameters with their learning rates."""
-        field = self.field
-        groups = [
-            ParameterGroup("density", tuple(field.density.parameters()), self._decaying(GRID_RATE)),
-            ParameterGroup("appearance", tuple(field.appearance.parameters()), self._decaying(GRID_RATE)),
-            ParameterGroup("shader", tuple(field.shader.parameters()), self._decaying(NETWORK_RATE)),
+        return [
+            ParameterGroup(name, tuple(part.parameters()), self._decaying(RATES[name]))
+            for name, part in self.field.named_children()
         ]
-        if field.environment is not None:
-            rate = self._decaying(ENVIRONMENT_RATE)
-            groups.append(ParameterGroup("environment", tuple(field.environment.parameters()), rate))
-        return groups
 
     def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
         """Return colours [B, 3] of rays in the world with jittered samples."""

@@ -249,10 +249,8 @@ class Densifier:
 
     def _empty(self) -> dict[str, Tensor]:
         zeros = self.splats.means.new_zeros(len(self.splats))
-        names = ["gradient", "seen"]
-        if self.options.positional_gradient == "space_absolute":
-            names.append("absolute")
-        return {name: zeros.clone() for name in names}
+        more = ["absolute"] if self.options.positional_gradient == "space_absolute" else []
+        return {name: zeros.clone() for name in ("gradient", "seen", *more)}
 
 
 def _largest(values: Tensor, count: int) -> Tensor:

@@ -112,12 +112,9 @@ def _interpolated(view: View, cloud: Tensor, rays: Tensor, others: Sequence[View
 def plane_sweep(view: View, rays: Tensor, inverse_depth: Tensor, around: Tensor, views: Sequence[View]) -> Tensor:
     """Return inverse depths [n] of pixels at which nearby views agree best in colour (plane sweep, Collins 1996).
 
-    Args:
-        view: panorama with an image; for other cameras nothing is changed.
-        rays: [n, 3] float64, of the pixels, camera frame.
-        inverse_depth: [n] > 0, the initial estimate, 1 / world units.
-        around: [n, K] > 0, of points around, which bound the candidates.
-        views: all views; those that are no panoramas or have no parallax are skipped, masks are ignored.
+    `rays` [n, 3] float64 are those of the pixels in the frame of the `view`, `inverse_depth` [n] > 0 is the initial
+    estimate, 1 / world units, and `around` [n, K] > 0 are those of points around, which bound the candidates. Views
+    that are no panoramas or have no parallax are skipped, and masks ignored; for other cameras nothing is changed.
     """
     if not isinstance(view.camera, Panorama) or len(rays) == 0:
         return inverse_depth

@@ -108,22 +108,16 @@ def sorted_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def hybrid_weights(alpha: Tensor, distance: Tensor, core_size: int) -> tuple[Tensor, Tensor]:
-    """Return the weights of fragments under hybrid transparency, and the transmittance (SPaGS).
+    """Return the weights [P, K] and transmittance [P] of fragments under hybrid transparency (SPaGS).
 
-    The core is the `core_size` nearest fragments with alpha >= 0.05, blended front to back until less than 1e-4 is
-    left, which then counts as 0. All others are the tail. With T the transmittance of the core, Z and Q the sum of
-    alpha and the product of 1 - alpha over the tail, the tail lies behind the core as one layer of opacity 1 - Q with
-    the mean colour weighted by alpha: a tail fragment has the weight T (1 - Q) alpha / Z. The choice of the core is a
-    constant to autograd. Fragments are sorted along the ray of the pixel, so that nothing pops when the order of the
-    means changes; the price is a tail without order.
-
-    Args:
-        alpha: [P, K] of every pixel and Gaussian, 0 where nothing is drawn.
-        distance: [P, K] along the ray, without gradient; the first in the list wins ties.
-        core_size: at least 1.
-
-    Returns:
-        weights [P, K] >= 0 and transmittance [P], which sum to 1 (to within 1e-4 where the core ended early).
+    `alpha` [P, K] is of every pixel and Gaussian, 0 where nothing is drawn, `distance` [P, K] along the ray, without
+    gradient; the first in the list wins ties. Weights and transmittance sum to 1, or to within 1e-4 where the core
+    ended early. The core is the `core_size` nearest fragments with alpha >= 0.05, blended front to back until less than
+    1e-4 is left, which then counts as 0. All others are the tail. With T the transmittance of the core, Z and Q the sum
+    of alpha and the product of 1 - alpha over the tail, the tail lies behind the core as one layer of opacity 1 - Q
+    with the mean colour weighted by alpha: a tail fragment has the weight T (1 - Q) alpha / Z. The choice of the core
+    is a constant to autograd. Fragments are sorted along the ray of the pixel, so that nothing pops when the order of
+    the means changes; the price is a tail without order.
     """
     solid = alpha.detach() >= CORE_ALPHA_MIN
     key = torch.where(solid, distance, torch.full_like(distance, torch.inf))
