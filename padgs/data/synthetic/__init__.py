@@ -63,32 +63,21 @@ def load(path: str | Path, options: DataOptions) -> Scene:
 
 def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scene:
     """Generate a scene, or read it from the disk cache; 30 views at 512x256 take 15-20 s of CPU time."""
-    stored, notes = read_cache(options), []
+    stored, problem = read_cache(options), None
     if stored is None:
         stored = _make(options)
         problem = write_cache(options, stored)
-        notes = [problem] if problem else []
         stored = read_cache(options) or stored
-    store = store or ImageStore()
-    held_out = set(paths.held_out(options))
-    train, test = [], []
+    store, held_out = store or ImageStore(), set(paths.held_out(options))
+    size, train, test = (options.width, options.height), [], []
     for index, (image, pose) in enumerate(zip(stored.images, stored.poses, strict=True)):
-        if isinstance(image, Path):
-            pixels = StoredImage(image, options.width, options.height, store)
-        else:
-            pixels = partial(torch.from_numpy, image)
-        size, depth = (options.width, options.height), partial(_depth, options, index)
+        pixels = StoredImage(image, *size, store) if isinstance(image, Path) else partial(torch.from_numpy, image)
+        depth = partial(_depth, options, index)
         view = View(f"{index:03d}", torch.from_numpy(pose), *size, pixels, load_depth=depth)
         (test if index in held_out else train).append(view)
-    return Scene(
-        name=options.title,
-        train=tuple(train),
-        test=tuple(test),
-        points=torch.from_numpy(stored.points).float(),
-        point_colors=torch.from_numpy(stored.colors),
-        fingerprint=stored.fingerprint,
-        notes=tuple(notes),
-    )
+    points, colors = torch.from_numpy(stored.points).float(), torch.from_numpy(stored.colors)
+    notes = (problem,) if problem else ()
+    return Scene(options.title, tuple(train), tuple(test), points, colors, stored.fingerprint, notes)
 
 
 @lru_cache(maxsize=64)

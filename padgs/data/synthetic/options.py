@@ -15,22 +15,16 @@ PATHS = ("roaming", "cross", "line")
 MAX_WIDTH, MAX_VIEWS, MAX_PIXELS = 16384, 10_000, 2_000_000_000
 HEADINGS = ("path", "fixed", "random")
 
+_WIDTHS = f"an even number from 8 to {MAX_WIDTH}, as a panorama is 2:1 (set data.width)"
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
-    (
-        "width",
-        lambda x: 8 <= x <= MAX_WIDTH and x % 2 == 0,
-        f"an even number from 8 to {MAX_WIDTH}, as a panorama is 2:1 (set data.width)",
-    ),
+    ("width", lambda x: 8 <= x <= MAX_WIDTH and x % 2 == 0, _WIDTHS),
     ("samples", lambda x: 1 <= x <= 1024 and math.isqrt(x) ** 2 == x, "a square number: 1, 4, 9, 16, 25, ... 1024"),
     ("train_views", lambda x: 2 <= x <= MAX_VIEWS, f"at least 2 and at most {MAX_VIEWS}"),
     ("test_views", lambda x: 0 <= x <= MAX_VIEWS, f"at least 0 and at most {MAX_VIEWS}"),
     ("points", lambda x: 1 <= x <= 10**8, "at least 1 and at most 100 million"),
     ("spokes", lambda x: x >= 1, "at least 1"),
-    (
-        "point_noise pose_noise_translation pose_noise_rotation tilt lens_gap",
-        lambda x: 0 <= x < math.inf,
-        "a finite number >= 0",
-    ),
+    ("point_noise tilt lens_gap", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
+    ("pose_noise_translation pose_noise_rotation", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
     ("texture_frequency world_scale", lambda x: 0 < x < math.inf, "a finite number > 0"),
     ("lens_blend", lambda x: 0 <= x < 90, "an angle in [0, 90) degrees"),
     ("lens_k1", lambda x: -0.1 <= x <= 0.1, "in [-0.1, 0.1]"),  # theta' must increase with theta up to 90 degrees
@@ -84,12 +78,11 @@ class SyntheticOptions:
             for name in names.split():
                 if not is_valid(value := getattr(self, name)):
                     raise DataError(f"data.generator.{name} is {value}; it must be {rule}")
-        pixels = (self.train_views + self.test_views) * self.width * self.height
-        if pixels > MAX_PIXELS:
+        views = self.train_views + self.test_views
+        if (pixels := views * self.width * self.height) > MAX_PIXELS:
             raise DataError(
-                f"{self.train_views + self.test_views} views of {self.width}x{self.height} are {pixels / 1e9:.1f} "
-                f"billion pixels, and at most {MAX_PIXELS / 1e9:g} are generated; lower data.width, "
-                "data.generator.train_views or test_views"
+                f"{views} views of {self.width}x{self.height} are {pixels / 1e9:.1f} billion pixels, and at most "
+                f"{MAX_PIXELS / 1e9:g} are generated; lower data.width, data.generator.train_views or test_views"
             )
         if self.rooms is not None and (self.scene != "room_chain" or self.rooms < 1):
             raise DataError(
@@ -106,20 +99,16 @@ class SyntheticOptions:
         >>> SyntheticOptions("outdoor", horizon=3000).title
         'synthetic-outdoor-horizon-3000m'
         """
-        words = ["synthetic", self.scene]
-        if self.path_radius is not None:
-            words.append("other-path")
-        lengths = {"nearest": self.nearest, "horizon": self.horizon}
-        words += [f"{name}-{length:g}m" for name, length in lengths.items() if length is not None]
-        if self.rooms is not None:
-            words.append(f"of-{self.rooms}")
-        if self.pose_noise_translation or self.pose_noise_rotation:
-            words.append("noisy-poses")
-        if self.lens_gap or self.lens_k1:
-            words.append("two-lenses")
-        if self.figure:
-            words.append("figure")
-        return "-".join(words)
+        words = {
+            "other-path": self.path_radius is not None,
+            f"nearest-{self.nearest or 0:g}m": self.nearest is not None,
+            f"horizon-{self.horizon or 0:g}m": self.horizon is not None,
+            f"of-{self.rooms}": self.rooms is not None,
+            "noisy-poses": self.pose_noise_translation or self.pose_noise_rotation,
+            "two-lenses": self.lens_gap or self.lens_k1,
+            "figure": self.figure,
+        }
+        return "-".join(["synthetic", self.scene, *(word for word, applies in words.items() if applies)])
 
     @property
     def height(self) -> int:

@@ -30,8 +30,9 @@ def curve(walk: Walk, kind: str, rng: np.random.Generator) -> Array:
     phases = rng.uniform(0, 2 * math.pi, 4)
     s = np.linspace(0, 1, _DENSE, endpoint=kind != "roaming")
     angle = 2 * math.pi * s
+    heights = walk.height + walk.sway * np.sin(3 * angle + phases[3])
     if kind == "roaming" and walk.waypoints:
-        return np.column_stack((_closed_spline(np.asarray(walk.waypoints), s), _heights(walk, angle, phases)))
+        return np.column_stack((_closed_spline(np.asarray(walk.waypoints), s), heights))
     if kind == "roaming":  # a randomly bent figure of eight
         x = np.sin(angle) + 0.15 * np.sin(3 * angle + phases[0])
         y = np.sin(2 * angle + 0.4 * math.sin(phases[1])) + 0.2 * np.cos(angle + phases[2])
@@ -41,12 +42,7 @@ def curve(walk: Walk, kind: str, rng: np.random.Generator) -> Array:
         x, y = np.where(s < 0.5, arm, 0), np.where(s < 0.5, 0, arm)
     else:
         x, y = 2 * s - 1, 0.08 * np.sin(2 * angle + phases[0])
-    flat = np.column_stack((x, y)) * walk.half + walk.center
-    return np.column_stack((flat, _heights(walk, angle, phases)))
-
-
-def _heights(walk: Walk, angle: Array, phases: Array) -> Array:
-    return walk.height + walk.sway * np.sin(3 * angle + phases[3])
+    return np.column_stack((np.column_stack((x, y)) * walk.half + walk.center, heights))
 
 
 def _closed_spline(points: Array, s: Array) -> Array:

@@ -212,10 +212,9 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
     roof = Material(build("roof"))
     horizon = 300.0 if options.horizon is None else options.horizon
     magnification = horizon / 300
-    shapes: list[Shape] = [
-        Ground((Material(_meadow(build)),)),
-        Ring(horizon, 60 * magnification, (Material(scaled(_mountains, 1 / magnification), glows=True),)),
-    ]
+    mountains = Material(scaled(_mountains, 1 / magnification), glows=True)
+    shapes: list[Shape] = [Ground((Material(_meadow(build)),)), Ring(horizon, 60 * magnification, (mountains,))]
+
     for k in range(14):
         far = 11 + 5.5 * k * rng.uniform(0.8, 1.2)
         angle = 2.4 * k + rng.uniform(-0.3, 0.3)
