@@ -19,6 +19,12 @@ from torch import Tensor
 from padgs.checks import unknown
 from padgs.geometry.camera import Camera
 
+Progress = Callable[[int, int], None]  # called with (done, total)
+
+
+def silent(done: int, total: int) -> None:
+    """Show no progress."""
+
 
 class DataError(ValueError):
     """Unusable input. The message names the file, the rule and the way out; no traceback is needed."""

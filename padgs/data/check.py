@@ -1,6 +1,6 @@
 """Checks of a data set: everything that is wrong with it, reported at once; and an image of its points."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor
 import padgs.data
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
-from padgs.data.capture import Capture, DataError, DataOptions, listed, view_name
+from padgs.data.capture import Capture, DataError, DataOptions, Progress, listed, silent, view_name
 from padgs.data.conventions import (
     MIN_CORRELATION,
     MIN_GAIN,
@@ -73,7 +73,7 @@ def check(
     format: str = "auto",
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     overlay: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> Report:
     """Check a data set. Problems are collected in `Report.problems`; they raise nothing.
 
@@ -149,7 +149,7 @@ def _check_depth(scene: Scene, report: Report) -> None:
     )
 
 
-def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> dict[str, str]:
+def _check_images(capture: Capture, report: Report, progress: Progress) -> dict[str, str]:
     """Decode all images, so that damaged files are found before training; return the digests of files by view."""
     digests = {}
     for done, frame in enumerate(capture.frames):

@@ -1,7 +1,6 @@
 """Conversion between formats: read and check everything, write to a temporary folder, then rename it."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import torch
 
 import padgs.data
 from padgs.data.assemble import assemble
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, view_name
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Progress, Tracks, silent, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
@@ -28,7 +27,7 @@ def convert(
     format: str = "auto",
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     known: KnownLength = KnownLength(),  # noqa: B008
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> Scene:
     """Write a data set in the format `to` of `padgs.data.formats.writers.WRITERS`, and return the scene of the source.
 
@@ -71,7 +70,7 @@ def convert(
     return scene
 
 
-def _write_images(capture: Capture, scene: Scene, target: Path, progress: Callable[[int, int], None]) -> Content:
+def _write_images(capture: Capture, scene: Scene, target: Path, progress: Progress) -> Content:
     """Copy or re-encode the images, and return the content of the files beside them."""
     views = {view.name: view for view in (*scene.train, *scene.test)}
     frames: dict[str, Frame] = {}  # by view

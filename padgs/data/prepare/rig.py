@@ -5,7 +5,6 @@ nearest centre, so that no feature is found twice. The views have the panorama's
 """
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from padgs.data.capture import Cloud, Frame, Tracks
+from padgs.data.capture import Cloud, Frame, Progress, Tracks
 from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
@@ -46,11 +45,7 @@ def owned(index: int, rays: Tensor) -> Tensor:
 
 
 def render_views(
-    images: dict[str, Path],
-    masks: dict[str, Path],
-    folder: Path,
-    mask_folder: Path,
-    progress: Callable[[int, int], None],
+    images: dict[str, Path], masks: dict[str, Path], folder: Path, mask_folder: Path, progress: Progress
 ) -> None:
     """Write the twelve views of every panorama, all of one size, as <view>/<name>.png.
 
@@ -91,15 +86,10 @@ def rig_config() -> Any:
     rotations = cam_from_pano()
     cameras = []
     for index, rotation in enumerate(rotations):
-        from_first = np.eye(3, 4)
-        from_first[:, :3] = (rotation @ rotations[0].mT).numpy()
-        cameras.append(
-            pycolmap.RigConfigCamera(
-                ref_sensor=index == 0,
-                image_prefix=f"{index:02d}/",
-                cam_from_rig=None if index == 0 else pycolmap.Rigid3d(from_first),
-            )
-        )
+        from_first = rigid(rotation @ rotations[0].mT, torch.zeros(3))[:3].numpy()
+        place = None if index == 0 else pycolmap.Rigid3d(from_first)
+        prefix = f"{index:02d}/"
+        cameras.append(pycolmap.RigConfigCamera(ref_sensor=index == 0, image_prefix=prefix, cam_from_rig=place))
     return pycolmap.RigConfig(cameras=cameras)
 
 

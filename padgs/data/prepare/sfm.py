@@ -6,17 +6,16 @@ process's standard error and ignores its own switches; `log_to` redirects that.
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from padgs.data.capture import DataError
+from padgs.data.capture import DataError, Progress
 from padgs.data.formats.colmap_lens import pycolmap_module
 
 MAPPERS = ("incremental", "global")
-Progress = Callable[[int, int], None]  # (done, total)
 
 # Tuned on real indoor and garden panoramas. COLMAP's defaults find only a thousand features in textureless rooms at
 # 2048 x 1024.
@@ -76,9 +75,8 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
                 camera_id = known[group.names[0]].camera_id
                 rig_id = entries.read_rig_with_sensor(entries.read_camera(camera_id).sensor_id).rig_id
             else:
-                if group.focal is None:
-                    model, params = "EQUIRECTANGULAR", [group.width, group.height]
-                else:
+                model, params = "EQUIRECTANGULAR", [group.width, group.height]
+                if group.focal is not None:
                     model, params = "SIMPLE_PINHOLE", [group.focal, group.width / 2, group.height / 2]
                 camera = pycolmap.Camera(model=model, width=group.width, height=group.height, params=params)
                 camera.has_prior_focal_length = True
@@ -128,24 +126,17 @@ def match(
 
 
 def reconstruct(
-    database: Path,
-    folder: Path,
-    parts: Path,
-    threads: int,
-    seed: int,
-    images_per_pose: int,
-    progress: Progress,
-    mapper: str = "incremental",
+    database: Path, folder: Path, parts: Path, threads: int, seed: int, views: int, progress: Progress, mapper: str
 ) -> int:
     """Compute poses and points; write a model for each part that cannot be connected to others, return their number.
 
-    `images_per_pose` is the number of views in a rig, else 1. `mapper` is one of `MAPPERS`: incremental adds one
-    panorama after the other, global places all at once; a DataError if the installed pycolmap cannot.
+    `views` is the number of views in a rig, else 1. `mapper` is one of `MAPPERS`: incremental adds one panorama after
+    the other, global places all at once; a DataError if the installed pycolmap cannot.
     """
     pycolmap = pycolmap_module()
     pycolmap.set_random_seed(seed)
     with pycolmap.Database.open(database) as found:
-        total = found.num_images() // images_per_pose
+        total = found.num_images() // views
     if mapper == "global":
         if not hasattr(pycolmap, "global_mapping"):
             raise DataError(f"pycolmap {pycolmap.__version__} has no global mapper; update it, or leave out --mapper")

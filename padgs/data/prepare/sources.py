@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,7 +14,7 @@ from PIL import Image
 
 from padgs.data import images as image_files
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
-from padgs.data.capture import Capture, DataError, Frame, listed
+from padgs.data.capture import Capture, DataError, Frame, Progress, listed, silent
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks
@@ -35,9 +35,7 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_EXTENSIONS
 
 
-def extract_frames(
-    video: Path, folder: Path, per_second: float, progress: Callable[[int, int], None] = lambda done, total: None
-) -> int:
+def extract_frames(video: Path, folder: Path, per_second: float, progress: Progress = silent) -> int:
     """Write the sharpest frame of every 1 / per_second seconds of a stitched video as frame_00001.jpg, ...; count them.
 
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
@@ -51,7 +49,7 @@ def extract_frames(
     return written
 
 
-def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], None]) -> Iterator[NDArray[np.uint8]]:
+def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[NDArray[np.uint8]]:
     """Yield the sharpest frame [H, W, 3] of every interval of time that has a frame."""
     try:
         import av

@@ -31,22 +31,17 @@ def directions(rows: Array, columns: Array, width: int, height: int) -> Array:
 
 
 def draw(
-    world: World,
-    cam_from_world: Array,
-    width: int,
-    samples: int,
-    seed: int = 0,
-    lens: Callable[[Array], Array] | None = None,
+    world: World, pose: Array, width: int, samples: int, seed: int = 0, lens: Callable[[Array], Array] | None = None
 ) -> Array:
-    """Render the panorama [H, W, 3] uint8 of a camera at `cam_from_world` [4, 4], with `samples` rays per pixel.
+    """Render the panorama [H, W, 3] uint8 of a camera at a cam_from_world pose [4, 4], `samples` rays per pixel.
 
     `lens` maps the camera-frame directions [3, n] of an ideal panorama to those of the rays.
     """
     height = width // 2
     image = np.empty((height, width, 3), np.uint8)
     jitter = _jitter(height, samples, seed)
-    world_from_cam = cam_from_world[:3, :3].T.astype(np.float32)
-    origin = center(cam_from_world)[:, None].astype(np.float32)
+    world_from_cam = pose[:3, :3].T.astype(np.float32)
+    origin = center(pose)[:, None].astype(np.float32)
     blocks = [(i, j) for i in range(0, height, _BLOCK[0]) for j in range(0, width, _BLOCK[1])]
 
     def fill(block: tuple[int, int]) -> None:

@@ -149,13 +149,7 @@ def loose_object(where: Point, size: float, rng: np.random.Generator, reflectanc
 
 
 def scatter(
-    count: int,
-    path: Array,
-    low: Point,
-    high: Point,
-    clearance: float,
-    rng: np.random.Generator,
-    reflectance: float = 0.0,
+    count: int, path: Array, low: Point, high: Point, clearance: float, rng: np.random.Generator, reflectance: float = 0
 ) -> list[Shape]:
     """Place loose objects in a box, apart from each other and from the camera path; low ones stand on thin rods."""
     shapes: list[Shape] = []

@@ -214,7 +214,6 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
     magnification = horizon / 300
     mountains = Material(scaled(_mountains, 1 / magnification), glows=True)
     shapes: list[Shape] = [Ground((Material(_meadow(build)),)), Ring(horizon, 60 * magnification, (mountains,))]
-
     for k in range(14):
         far = 11 + 5.5 * k * rng.uniform(0.8, 1.2)
         angle = 2.4 * k + rng.uniform(-0.3, 0.3)
