@@ -84,15 +84,10 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         view = View(view_name(frame.name), frame.cam_from_world, *size, pixels, mask, lens, share=frame.share)
         views.append(view if lens is None else replace(view, sphere_share=sphere_share(lens)))
     views, depth_digests, depth_notes = with_depths(views, capture, options)
-    scene = Scene(
-        name=capture.name or Path(os.path.abspath(capture.folder)).name,  # works for "." too; a link keeps its name
-        train=tuple(views[i] for i in split.train),
-        test=tuple(views[i] for i in split.test),
-        points=points,
-        point_colors=colors,
-        fingerprint="",
-        notes=(*notes, *split.notes, *mask_notes, *depth_notes, *cloud_notes, *cache_notes),
-    ).recentered()
+    name = capture.name or Path(os.path.abspath(capture.folder)).name  # works for "." too; a link keeps its name
+    train, test = (tuple(views[i] for i in part) for part in (split.train, split.test))
+    all_notes = (*notes, *split.notes, *mask_notes, *depth_notes, *cloud_notes, *cache_notes)
+    scene = Scene(name, train, test, points, colors, fingerprint="", notes=all_notes).recentered()
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):
         digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
@@ -240,16 +235,13 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
             continue
+        text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
         if frame.lens is not None:
             if abs(image.width / frame.width - image.height / frame.height) > 0.01:
-                raise DataError(
-                    f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}; make "
-                    "them agree"
-                )
+                raise DataError(f"{text}; make them agree")
             continue
         if frame.width != 2 * frame.height or frame.width < 1:
             raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; a full panorama is 2:1")
-        text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
         scales.setdefault(image.width / frame.width, text)
     if len(scales) > 1:
         differ = "; but ".join(list(scales.values())[:2])

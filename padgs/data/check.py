@@ -11,20 +11,10 @@ from PIL import Image
 from torch import Tensor
 
 import padgs.data
+from padgs.data import conventions
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
 from padgs.data.capture import Capture, DataError, DataOptions, Progress, listed, silent, view_name
-from padgs.data.conventions import (
-    MIN_CORRELATION,
-    MIN_GAIN,
-    POINTS,
-    VIEWS,
-    colour_fit,
-    exposure_gains,
-    known_conventions,
-    reprojection_errors,
-    small_images,
-)
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
 from padgs.geometry.panorama import project
@@ -143,10 +133,8 @@ def _check_depth(scene: Scene, report: Report) -> None:
     if agree >= DEPTH_AGREES:
         report.notes.append(text)
         return
-    report.problems.append(
-        f"{text}, and are about {scale:.2g} times as far; correct the unit or measure in depth.json, or set "
-        "data.depth=none"
-    )
+    remedy = "correct the unit or measure in depth.json, or set data.depth=none"
+    report.problems.append(f"{text}, and are about {scale:.2g} times as far; {remedy}")
 
 
 def _check_images(capture: Capture, report: Report, progress: Progress) -> dict[str, str]:
@@ -205,7 +193,7 @@ def _check_leaks(scene: Scene, digests: dict[str, str], report: Report) -> None:
 
 def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     """Compare points with observations, else with colours, under the stated and other pose conventions."""
-    conventions = known_conventions()
+    known = conventions.known_conventions()
     tracks = None if capture.tracks is None or capture.cloud is None else capture.tracks()
     if tracks is not None:  # those of photographs are not compared
         tracks = tracks.at(torch.tensor([frame.lens is None for frame in capture.frames])[tracks.frame])
@@ -214,21 +202,20 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     if tracks is not None and len(tracks.frame) and len(sizes) == 1 and width is not None and height is not None:
         assert capture.cloud is not None
         poses, points = torch.stack([frame.cam_from_world for frame in capture.frames]), capture.cloud.points
-        error = reprojection_errors(poses, points, tracks, width, height)
+        error = conventions.reprojection_errors(poses, points, tracks, width, height)
         report.observations = len(error)
         report.reprojection_median = error.median().item()
         report.reprojection_95 = error.sort().values[int(0.95 * (len(error) - 1))].item()
         limit = MAX_REPROJECTION * width
         if report.reprojection_median > limit:
-            report.problems.append(
-                f"the median reprojection error is {report.reprojection_median:.1f} pixels; it must be at most "
-                f"{limit:.1f} at this size"
-            )
-            some = tracks.at(slice(None, None, max(1, len(tracks.frame) // POINTS)))
-            candidates = (convention.convert(poses.double()) for convention in conventions)
-            errors = [reprojection_errors(pose, points, some, width, height).median().item() for pose in candidates]
+            rule = f"it must be at most {limit:.1f} at this size"
+            report.problems.append(f"the median reprojection error is {report.reprojection_median:.1f} pixels; {rule}")
+            some = tracks.at(slice(None, None, max(1, len(tracks.frame) // conventions.POINTS)))
+            tried = (one.convert(poses.double()) for one in known)
+            found = [conventions.reprojection_errors(pose, points, some, width, height) for pose in tried]
+            errors = [error.median().item() for error in found]
             if min(errors) <= limit:
-                report.suggestion = conventions[errors.index(min(errors))].words
+                report.suggestion = known[errors.index(min(errors))].words
     # A few points, or points of one colour, correlate with anything or nothing.
     compared = report.coloured and report.points >= MIN_POINTS and scene.point_colors.float().std(0).max() >= 1
     if not (compared or report.observations):
@@ -240,24 +227,24 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     if not compared:
         return
     views = (*scene.train, *scene.test)
-    views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
+    views = views[:: max(1, len(views) // conventions.VIEWS)][: conventions.VIEWS]
     # In the world of the data set.
     poses = move_origin(torch.stack([view.cam_from_world for view in views]), -scene.origin).double()
     points, images = scene.points.double() + scene.origin, _small(views)
-    fits = [colour_fit(known.convert(poses), images, points, scene.point_colors) for known in conventions]
-    stated, best = fits[0], max(fits)
+    fits = [conventions.colour_fit(one.convert(poses), images, points, scene.point_colors) for one in known]
+    stated, best, least = fits[0], max(fits), conventions.MIN_CORRELATION
     report.colour_correlation = stated
-    if best > max(MIN_CORRELATION, stated + MIN_GAIN) and report.suggestion is None:
+    if best > max(least, stated + conventions.MIN_GAIN) and report.suggestion is None:
         report.problems.append(
             f"points and panoramas do not agree: their colours correlate by {stated:.2f} with the poses as "
             f"stated, and by {best:.2f} under another convention"
         )
-        report.suggestion = conventions[fits.index(best)].words
-    elif stated < MIN_CORRELATION and report.suggestion is None:
+        report.suggestion = known[fits.index(best)].words
+    elif stated < least and report.suggestion is None:
         report.problems.append(
-            f"the colours of points and panoramas correlate by only {stated:.2f} (at least {MIN_CORRELATION} if they "
-            "agree), and under no other known convention better; look at the overlay. Are these the images, points and "
-            "poses of one reconstruction, with the names in the right order?"
+            f"the colours of points and panoramas correlate by only {stated:.2f} (at least {least} if they agree), and "
+            "under no other known convention better; look at the overlay. Are these the images, points and poses of "
+            "one reconstruction, with the names in the right order?"
         )
 
 
@@ -266,7 +253,8 @@ def _check_exposures(scene: Scene, report: Report) -> None:
     views = scene.train[:: -(-len(scene.train) // EXPOSURE_VIEWS)]
     if len(views) < 2:
         return
-    gains = exposure_gains(torch.stack([view.cam_from_world for view in views]), _small(views), scene.points)
+    poses = torch.stack([view.cam_from_world for view in views])
+    gains = conventions.exposure_gains(poses, _small(views), scene.points)
     report.exposure_spread = gains.std().item()
     if report.exposure_spread >= UNEVEN_EXPOSURE:
         dark, bright = (views[int(index)].name for index in (gains.argmin(), gains.argmax()))
@@ -277,7 +265,7 @@ def _check_exposures(scene: Scene, report: Report) -> None:
 
 
 def _small(views: Sequence[View]) -> Tensor:
-    return small_images(view.load_pixels().cpu().numpy() for view in views if view.load_pixels)
+    return conventions.small_images(view.load_pixels().cpu().numpy() for view in views if view.load_pixels)
 
 
 def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:

@@ -116,13 +116,12 @@ def known_conventions() -> list[Convention]:
         "the camera centres are translations: use C = -R^T C": lambda p: _with(p, centers(p)[..., None]),
         "the quaternions are in the order x y z w: write them as w x y z": _reordered,
     }
-    same, *others = _signed_axes()
-    found = []
-    for (correction, convert), (words, axes) in product(corrections.items(), (same, *others)):
+    signed, found = [*_signed_axes()], []
+    for (correction, convert), (words, axes) in product(corrections.items(), signed):
         text = "; ".join(filter(None, (correction, words and f"camera axes: {words}")))
         text = text or "the poses are right as they are"
         found.append(Convention(text, lambda poses, convert=convert, axes=axes: axes @ convert(poses)))
-    for words, axes in others:
+    for words, axes in signed[1:]:
         text = f"poses and points are in different world frames: rotate the points, {words}"
         found.append(Convention(text, lambda poses, axes=axes: poses @ axes))
     return found

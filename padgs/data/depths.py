@@ -92,10 +92,8 @@ def with_depths(
         values = read_depth(file)
         height, width = values.shape
         if width * view.height != height * view.width:
-            raise DataError(
-                f"{file} is {width}x{height}, and {frame.name} is {view.width}x{view.height}; a depth map must have "
-                "the shape of its image, in any size"
-            )
+            differ = f"{file} is {width}x{height}, and {frame.name} is {view.width}x{view.height}"
+            raise DataError(f"{differ}; a depth map must have the shape of its image, in any size")
         if not (np.isfinite(values) & (values > 0) & (values < SKY)).any():
             raise DataError(f"{file} holds no distance above 0; remove it, or set data.depth=none")
         sizes.add(f"{width}x{height}")
@@ -152,10 +150,8 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
     if capture.depth is not None:
         named = {frame.name: frame.depth for frame in capture.frames if frame.depth is not None}
         if absent := [path for path in named.values() if not path.is_file()]:
-            raise DataError(
-                f"{len(absent)} depth maps of {capture.format} do not exist ({listed(absent)}); copy them, or set "
-                "data.depth=none"
-            )
+            lost = f"{len(absent)} depth maps of {capture.format} do not exist ({listed(absent)})"
+            raise DataError(f"{lost}; copy them, or set data.depth=none")
         return named, capture.depth if named else None, []
     places, notes = (capture.folder, capture.image_folder.parent), []
     for folder in dict.fromkeys(base / name for base in places for name in FOLDERS):
@@ -176,9 +172,7 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
             return files, _stated(folder / STATEMENT, is_png), notes
         if there:
             examples = f"{next(iter(there.values())).name} for {capture.frames[0].name}"
-            notes.append(
-                f"depth: none of the {len(there)} maps in {folder} has the name of an image, such as {examples}"
-            )
+            notes.append(f"depth: none of the {len(there)} maps in {folder} is named like an image, such as {examples}")
     return {}, None, notes
 
 

@@ -17,15 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from padgs.data import image_metadata
 from padgs.data.capture import DataError, listed, refuse_special
-from padgs.data.image_metadata import (
-    Crop,
-    crop_of,
-    load_late_chunks,
-    refuse_rotated,
-    refuse_several_pictures,
-    srgb_conversion,
-)
 from padgs.files import DAMAGE, ImageError, open_image
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
@@ -44,7 +37,7 @@ class ImageFile:
     width: int
     height: int
     digest: str
-    crop: Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
+    crop: image_metadata.Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
     converted: bool = False  # whether other programs read other pixels, because the colours are not sRGB
 
 
@@ -56,13 +49,13 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFi
     """
     data = read_bytes(path)
     with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
-        load_late_chunks(image, data)
-        refuse_rotated(image, path)
-        refuse_several_pictures(image, path)
+        image_metadata.load_late_chunks(image, data)
+        image_metadata.refuse_rotated(image, path)
+        image_metadata.refuse_several_pictures(image, path)
         mode = image.mode
         _refuse_other_modes(image, data, path, mask)
-        crop = crop_of(image, path) if panorama else None
-        conversion = None if mask else srgb_conversion(image, data, path)
+        crop = image_metadata.crop_of(image, path) if panorama else None
+        conversion = None if mask else image_metadata.srgb_conversion(image, data, path)
         size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
         may_be_transparent = mode in _ALPHA or "transparency" in image.info
     if panorama:
@@ -138,8 +131,8 @@ def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
     with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
         image.load()
         transparent = _is_transparent(image)
-        convert = srgb_conversion(image, data, path) if mode == "RGB" else None
-        crop, stored = crop_of(image, path), _eight_bit(image).convert(mode)
+        convert = image_metadata.srgb_conversion(image, data, path) if mode == "RGB" else None
+        crop, stored = image_metadata.crop_of(image, path), _eight_bit(image).convert(mode)
         cut = _misses_pixels(image, data, np.asarray(stored))
         pixels = np.array(stored if convert is None else convert(stored))
     if cut:

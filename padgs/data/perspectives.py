@@ -80,12 +80,12 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
     _refuse_photographs(panorama)
     views, pixels, mask = [], panorama.load_pixels, panorama.load_mask
     for number, rotation in enumerate(rotations.double()):
-        pose = panorama.cam_from_world.clone()
+        pose, name = panorama.cam_from_world.clone(), f"{panorama.name}-{number}"
         pose[:3] = rotation.to(pose) @ pose[:3]
         load_pixels = pixels and _Pixels(panorama, rotation, lens, pixels)
         load_mask = mask and _Mask(panorama, rotation, lens, mask)
-        view = View(f"{panorama.name}-{number}", pose, lens.width, lens.height, load_pixels, load_mask, lens)
-        views.append(replace(view, share=panorama.share))
+        size = lens.width, lens.height
+        views.append(View(name, pose, *size, load_pixels, load_mask, lens, share=panorama.share))
     return tuple(views)
 
 

@@ -137,7 +137,7 @@ def test_habits_of_names_of_depth_maps(image: str, depth: str, world: World, tmp
     assert _depth_files(capture)[0] == {image: file}
     other = replace(capture, frames=(replace(capture.frames[0], name="b.png"),))
     files, meaning, (note,) = _depth_files(other)
-    assert (files, meaning) == ({}, None) and f"none of the 1 maps in {tmp_path / 'depths'} has the name of an" in note
+    assert (files, meaning) == ({}, None) and f"none of the 1 maps in {tmp_path / 'depths'} is named like an" in note
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.001])

@@ -14,19 +14,7 @@ from torch import Tensor
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, listed
 from padgs.data.cloud import first_ply
-from padgs.data.formats.colmap_files import (
-    FILES,
-    NO_POINT,
-    PANORAMIC,
-    Camera,
-    Image,
-    Points,
-    find_file,
-    read_cameras,
-    read_frames,
-    read_images,
-    read_points,
-)
+from padgs.data.formats import colmap_files as model_files
 from padgs.data.formats.colmap_lens import lens_of
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.splits import check_name
@@ -38,7 +26,7 @@ def find_model(path: Path) -> Path | None:
     """Find the folder with the model's files, in a data set's folder or itself; the largest of several parts."""
     for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
         parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
-        sizes = {part: file.stat().st_size for part in parts if (file := find_file(part, "images"))}
+        sizes = {part: file.stat().st_size for part in parts if (file := model_files.find_file(part, "images"))}
         if sizes:
             return max(sizes, key=lambda part: sizes[part])
     return None
@@ -52,9 +40,9 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     model = model or find_model(path)
     if model is None:
         raise DataError(f"{path} holds no COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0)")
-    files = {name: file for name in FILES if (file := find_file(model, name))}
+    files = {name: file for name in model_files.FILES if (file := model_files.find_file(model, name))}
     colored = None if "points3D" in files else first_ply(model, PLY)
-    needed = FILES if colored is None and options.points == "auto" else FILES[:2]
+    needed = model_files.FILES if colored is None and options.points == "auto" else model_files.FILES[:2]
     absent = [name for name in needed if name not in files]
     if absent:
         raise DataError(
@@ -62,9 +50,11 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
             + (", or set data.points to a PLY file or to random" if absent == ["points3D"] else "")
         )
     folder = image_folder(path, options.images)
-    cameras = dict(read_cameras(files["cameras"]))
-    images = sorted(read_images(files["images"]), key=lambda image: image.id)
-    points = read_points(files["points3D"]) if "points3D" in files else Points({}, colored, frozenset())
+    cameras = dict(model_files.read_cameras(files["cameras"]))
+    images = sorted(model_files.read_images(files["images"]), key=lambda image: image.id)
+    points = model_files.Points({}, colored, frozenset())
+    if "points3D" in files:
+        points = model_files.read_points(files["points3D"])
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
     notes = [*_file_notes(path, model, files, colored is not None), *_reference_notes(images, points)]
     notes += _frame_notes(model, files["images"], images)
@@ -72,7 +62,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     return Capture("colmap", path, folder, frames, points.cloud, tracks=tracks, notes=tuple(notes))
 
 
-def pose_of(image: Image, where: str) -> Tensor:
+def pose_of(image: model_files.Image, where: str) -> Tensor:
     """Return cam_from_world [4, 4] of an image; `where` names it in errors."""
     pose = torch.tensor(image.pose, dtype=torch.float64)
     return cam_from_world(rotation_from_quaternion(pose[:4], where), pose[4:], where)
@@ -81,17 +71,18 @@ def pose_of(image: Image, where: str) -> Tensor:
 def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) -> list[str]:
     """Say which files are used where there are several of one kind."""
     notes = ["points: from a PLY file beside the model, which has no points3D of its own"] if colored else []
-    parts = [part.name for part in sorted(model.parent.glob("*")) if part != model and find_file(part, "images")]
+    parts = [part for part in sorted(model.parent.glob("*")) if part != model and model_files.find_file(part, "images")]
     if model != path and parts:
-        notes.append(f"the model has several parts; the largest, {model.name}, is used, not {listed(parts)}")
+        others = listed(part.name for part in parts)
+        notes.append(f"the model has several parts; the largest, {model.name}, is used, not {others}")
     if double := [file.name for file in files.values() if file.suffix == ".bin" and file.with_suffix(".txt").is_file()]:
         notes.append(f"the model is there as text and binary; {listed(double)} are used, not the text files")
     return notes
 
 
-def _frame_notes(model: Path, file: Path, images: list[Image]) -> list[str]:
+def _frame_notes(model: Path, file: Path, images: list[model_files.Image]) -> list[str]:
     """Say where the poses of frames.bin (COLMAP 4) differ from those of the images file."""
-    frames = read_frames(model / "frames.bin") if (model / "frames.bin").is_file() else {}
+    frames = model_files.read_frames(model / "frames.bin") if (model / "frames.bin").is_file() else {}
     flip = np.array([-1, -1, -1, -1, 1, 1, 1])  # a quaternion and its negative are one rotation
     differing = [
         image.name
@@ -103,12 +94,12 @@ def _frame_notes(model: Path, file: Path, images: list[Image]) -> list[str]:
     return [f"frames.bin states other poses than {file.name} ({listed(differing)}); {used}"] if differing else []
 
 
-def _reference_notes(images: list[Image], points: Points) -> list[str]:
+def _reference_notes(images: list[model_files.Image], points: model_files.Points) -> list[str]:
     """Say which references between the files lead nowhere; they are left out."""
     notes = []
     named = np.concatenate([np.zeros(0, np.int64), *(image.points for image in images)])
     known = np.isin(named, list(points.row_of))
-    absent = int((~known & (named != NO_POINT)).sum())
+    absent = int((~known & (named != model_files.NO_POINT)).sum())
     if absent and points.row_of:
         total = absent + int(known.sum())
         notes.append(f"{absent} of {total} observations are of points that the model does not hold; they are left out")
@@ -118,16 +109,16 @@ def _reference_notes(images: list[Image], points: Points) -> list[str]:
     return notes
 
 
-def _frame(image: Image, camera: Camera | None, folder: Path, model: Path) -> Frame:
-    name = check_name(image.name, str(find_file(model, "images")))
+def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: Path, model: Path) -> Frame:
+    name = check_name(image.name, str(model_files.find_file(model, "images")))
     where = f"{name} in {model}"
     if camera is None:
         raise DataError(f"{where} has a camera that the model does not hold; export the whole model")
-    lens = None if camera.model in PANORAMIC else partial(lens_of, camera, where)
+    lens = None if camera.model in model_files.PANORAMIC else partial(lens_of, camera, where)
     return Frame(name, folder / name, pose_of(image, where), camera.width, camera.height, lens=lens)
 
 
-def _tracks(images: list[Image], row_of: dict[int, int]) -> Tracks:
+def _tracks(images: list[model_files.Image], row_of: dict[int, int]) -> Tracks:
     """Return the observations of points that exist."""
     return Tracks.from_observations(
         (frame, row_of[point], pixel)

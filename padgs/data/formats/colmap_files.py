@@ -207,7 +207,5 @@ def _entries(file: Path, entry: Callable[[_Cursor], T]) -> list[T]:
     except (struct.error, IndexError, OverflowError) as error:
         raise DataError(f"{file} ends early or is not a COLMAP file; copy it again or rebuild the model") from error
     if cursor.offset != len(cursor.data):
-        raise DataError(
-            f"{file} has {len(cursor.data)} bytes but its {count} entries take {cursor.offset}; copy it again"
-        )
+        raise DataError(f"{file} has {len(cursor.data)} bytes, its {count} entries take {cursor.offset}; copy it again")
     return found

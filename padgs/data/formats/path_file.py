@@ -51,10 +51,8 @@ def _keyframe(entry: Json, up: Tensor) -> Tensor:
     if not torch.cat((position, target, up)).isfinite().all():
         raise DataError(f"{entry.where}: position, look_at or up is not finite; give numbers")
     if position.equal(target) or not up.any():
-        raise DataError(
-            f"{entry.where}: position and look_at are both {position.tolist()}, or up is 0; give different positions "
-            "and a non-zero up"
-        )
+        equal = f"position and look_at are both {position.tolist()}, or up is 0"
+        raise DataError(f"{entry.where}: {equal}; give different positions and a non-zero up")
     return look_along(position[None].numpy(), (target - position)[None].numpy(), (up / up.norm()).numpy())[0]
 
 

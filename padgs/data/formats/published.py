@@ -26,16 +26,10 @@ from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, Frame, listed
 from padgs.data.cloud import first_ply
 from padgs.data.datasets import DATASETS
+from padgs.data.formats import poses
 from padgs.data.formats.colmap import pose_of
 from padgs.data.formats.colmap_files import read_images, read_points
 from padgs.data.formats.json_file import Json, file_in, read_json
-from padgs.data.formats.poses import (
-    cam_from_opengl_pose,
-    cam_from_pose,
-    cam_from_world,
-    rigid,
-    rotation_from_quaternion,
-)
 from padgs.data.splits import LISTS, check_name, read_lines, read_list
 
 
@@ -51,7 +45,7 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
         for item in data[side].entries():
             name = item["rgb_file"].name()
             matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
-            frames.append(Frame(name, images / name, cam_from_pose(matrix.numbers(4, 4), matrix.where)))
+            frames.append(Frame(name, images / name, poses.cam_from_pose(matrix.numbers(4, 4), matrix.where)))
             names.append(name)
         split[side] = tuple(names)
     if twice := set(split["train"]) & set(split["test"]):
@@ -94,7 +88,7 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
     for item in meta["frames"].entries():
         name = item["file_path"].name()
         matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
-        pose = cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
+        pose = poses.cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
     return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, _OMNIBLENDER_CLOUDS))
 
@@ -113,7 +107,7 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
         frames[number] = Frame(
             f"{number}_rgb.png",
             images / f"{number}_rgb.png",
-            cam_from_world(pose["rotation"].numbers(3, 3), pose["translation"].numbers(3), str(file)),
+            poses.cam_from_world(pose["rotation"].numbers(3, 3), pose["translation"].numbers(3), str(file)),
             camera["width"].whole(),
             camera["height"].whole(),
             depth=depth if depth.parent.is_dir() else None,
@@ -151,8 +145,8 @@ def read_tartanair(path: Path, options: DataOptions) -> Capture:
             raise DataError(f"{where} is {line[:60]!r}; it must be: frame x y z qx qy qz qw") from error
         if len(values) != 7:
             raise DataError(f"{where} has {len(values)} numbers after the frame; it must have 7: x y z qx qy qz qw")
-        body = rotation_from_quaternion(values[[6, 3, 4, 5]], where)
-        pose = cam_from_pose(rigid(body @ _BODY_FROM_CAMERA, values[:3]), where)
+        body = poses.rotation_from_quaternion(values[[6, 3, 4, 5]], where)
+        pose = poses.cam_from_pose(poses.rigid(body @ _BODY_FROM_CAMERA, values[:3]), where)
         depth = path / "depth" / f"{name}.png"
         jpeg, png = images / f"{name}.jpg", images / f"{name}.png"
         image = png if png.is_file() and not jpeg.is_file() else jpeg

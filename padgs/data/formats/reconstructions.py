@@ -94,9 +94,8 @@ def _mvg_poses(data: Json) -> dict[int, Tensor]:
         pose = Json(item["value"].value, f"extrinsic {key} of {data.where}")
         poses[key] = cam_from_center(pose["rotation"].numbers(3, 3), pose["center"].numbers(3), pose.where)
     if not poses:
-        raise DataError(
-            f"{data.where} holds no extrinsics; export them too (openMVG_main_ConvertSfM_DataFormat -V -I -E -S)"
-        )
+        export = "openMVG_main_ConvertSfM_DataFormat -V -I -E -S"
+        raise DataError(f"{data.where} holds no extrinsics; export them too ({export})")
     return poses
 
 

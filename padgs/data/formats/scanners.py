@@ -116,9 +116,7 @@ def _frame(image: Any, where: str, folder: Path, name: str) -> Frame | None:
     if kind is None:
         raise DataError(f"{where} has neither jpegImage nor pngImage; export the panoramas as JPEG")
     if not image.isDefined("pose") or not image.isDefined("pose/translation"):
-        raise DataError(
-            f"{where} has no pose; export the panoramas with poses, or run `padgs prepare` on the images alone"
-        )
+        raise DataError(f"{where} has no pose; export the panoramas with poses, or run `padgs prepare` on the images")
     pose = image["pose"]
     turn = [pose["rotation"][axis].value() for axis in "wxyz"] if pose.isDefined("rotation") else [1.0, 0.0, 0.0, 0.0]
     center = [pose["translation"][axis].value() for axis in "xyz"]

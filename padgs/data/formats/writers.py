@@ -29,9 +29,8 @@ def write_colmap(content: Content, folder: Path) -> None:
     """Write a binary model with rigs and frames to sparse/0, and the lists."""
     pycolmap = pycolmap_module()
     if content.cloud is None:
-        raise DataError(
-            "there is no point cloud, and a COLMAP model needs one; set data.points to a PLY file or random"
-        )
+        lacks = "there is no point cloud, and a COLMAP model needs one"
+        raise DataError(f"{lacks}; set data.points to a PLY file or random")
     tracks, model = content.tracks or Tracks.from_observations([]), pycolmap.Reconstruction()
     elements: dict[int, list[Any]] = {}  # point -> its track
     cameras: dict[tuple[int, int], int] = {}
@@ -42,9 +41,8 @@ def write_colmap(content: Content, folder: Path) -> None:
             camera = {"model": "EQUIRECTANGULAR", "width": size[0], "height": size[1], "params": size}
             model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=cameras[size], **camera))
         seen = tracks.frame == image_id - 1
-        image = pycolmap.Image(
-            name=frame.name, keypoints=tracks.pixels[seen].numpy(), camera_id=cameras[size], image_id=image_id
-        )
+        pixels = tracks.pixels[seen].numpy()
+        image = pycolmap.Image(name=frame.name, keypoints=pixels, camera_id=cameras[size], image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.cam_from_world[:3].numpy()))
         for index, point in enumerate(tracks.point[seen].tolist()):
             elements.setdefault(point, []).append(pycolmap.TrackElement(image_id, index))
@@ -87,9 +85,7 @@ def write_openmvg(content: Content, folder: Path) -> None:
         wrapper = {"id": 2147483650 + len(views) + key, "data": data}
         intrinsics.append({"key": key, "value": {**kind, "ptr_wrapper": wrapper}})
     cloud, tracks = content.cloud or Cloud(torch.zeros(0, 3), None), content.tracks or Tracks.from_observations([])
-    structure = [
-        {"key": key, "value": {"X": point, "observations": []}} for key, point in enumerate(cloud.points.tolist())
-    ]
+    structure = [{"key": k, "value": {"X": x, "observations": []}} for k, x in enumerate(cloud.points.tolist())]
     if cloud.colors is not None:
         write_ply(folder / "colorized.ply", cloud)
     rows = zip(tracks.frame.tolist(), tracks.point.tolist(), tracks.pixels.tolist(), strict=True)

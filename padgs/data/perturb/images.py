@@ -180,10 +180,8 @@ def resolution(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
 
     def shrink(view: View) -> View:
         if view.width % (2 * factor) or view.height % factor:
-            raise ValueError(
-                f"view {view.name!r} is {view.width}x{view.height}, which is not divisible by {factor}; set "
-                "data.width to a multiple of 16"
-            )
+            size = f"{view.width}x{view.height}, which is not divisible by {factor}"
+            raise ValueError(f"view {view.name!r} is {size}; set data.width to a multiple of 16")
 
         def pool(pixels: Tensor) -> Tensor:
             return _pool(pixels.float(), factor, stride=factor).round().to(torch.uint8)
@@ -191,8 +189,8 @@ def resolution(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
         def pool_mask(mask: Tensor) -> Tensor:
             return _pool(mask[..., None], factor, stride=factor)[..., 0]
 
-        size = {"width": view.width // factor, "height": view.height // factor, "load_depth": None}
-        return replace(change_pixels(_panorama(view), pool, pool_mask), **size)
+        width, height = view.width // factor, view.height // factor
+        return replace(change_pixels(_panorama(view), pool, pool_mask), width=width, height=height, load_depth=None)
 
     return change_training_views(scene, shrink)
 

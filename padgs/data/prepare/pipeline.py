@@ -26,21 +26,10 @@ from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
 from padgs.data.metres import UPRIGHT, Z, moved, to_metres, write_unit
-from padgs.data.prepare import rig, sfm
+from padgs.data.prepare import rig, sfm, work
 from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
-from padgs.data.prepare.work import (
-    LOCK,
-    Prepared,
-    PrepareOptions,
-    WorkFolder,
-    digest_of,
-    find_result,
-    fingerprint,
-    link_or_copy,
-    refuse_full,
-    threads_for,
-)
+from padgs.data.prepare.work import Prepared, PrepareOptions, WorkFolder, digest_of
 from padgs.geometry.similarity import Similarity
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
@@ -72,14 +61,14 @@ def prepare(
         return result
     if destination.name in (*IMAGE_FOLDERS, *MASK_FOLDERS) and destination.resolve().parent == source.resolve():
         raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
-    work = destination.absolute().with_name(f".{destination.name}.prepare")
-    lock = FileLock(work / LOCK)
+    place = destination.absolute().with_name(f".{destination.name}.prepare")
+    lock = FileLock(place / work.LOCK)
     try:
-        work.mkdir(parents=True, exist_ok=True)
+        place.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
         if result := _existing(source, destination, options):  # of another process, in the meantime
             return result
-        return _Job(source, destination.absolute(), work, options, progress).run()
+        return _Job(source, destination.absolute(), place, options, progress).run()
     except Timeout as error:
         raise DataError(f"another process prepares {destination}; wait for it, or choose another path") from error
     except OSError as error:
@@ -90,14 +79,14 @@ def prepare(
             f"cannot prepare {destination} (out of memory); the same command with --threads 1 uses less, and resumes"
         ) from error
     except RuntimeError as error:  # of pycolmap, its database included
-        message = _pycolmap_message(error, work / "log.txt")
+        message = _pycolmap_message(error, place / "log.txt")
         raise DataError(
             f"cannot prepare {destination} ({message}); if its disk is full, free some space and repeat the command, "
-            f"which resumes; else remove {work} to start over"
+            f"which resumes; else remove {place} to start over"
         ) from error
     finally:
-        if lock.is_locked and work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
-            shutil.rmtree(work, ignore_errors=True)  # nothing to resume
+        if lock.is_locked and place.is_dir() and not any(place.glob("*.done")) and not (place / "database.db").exists():
+            shutil.rmtree(place, ignore_errors=True)  # nothing to resume
         lock.release()
 
 
@@ -105,25 +94,23 @@ def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepa
     """Return the result of an earlier call; None if the destination is free, a DataError if something else is there."""
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
         return None
-    if result := find_result(source, destination, options):
+    if result := work.find_result(source, destination, options):
         return result
-    raise DataError(
-        f"{destination} exists, and was not made of {source} with these options; nothing is overwritten: remove it "
-        "or choose another path"
-    )
+    what = f"{destination} exists, and was not made of {source} with these options"
+    raise DataError(f"{what}; nothing is overwritten: remove it or choose another path")
 
 
 class _Job:
     """A preparation in its working folder."""
 
     def __init__(
-        self, source: Path, destination: Path, work: Path, options: PrepareOptions, progress: Progress
+        self, source: Path, destination: Path, place: Path, options: PrepareOptions, progress: Progress
     ) -> None:
-        self.destination, self.work, self.options, self.progress = destination, work, options, progress
-        self.folder = WorkFolder(work)
+        self.destination, self.work, self.options, self.progress = destination, place, options, progress
+        self.folder = WorkFolder(place)
         given = None
         if is_video(source):
-            of_video = fingerprint(source, options)
+            of_video = work.fingerprint(source, options)
             given = digest_of(of_video, options)
             self.folder.open("video", digest_of(of_video, options, _LATE))
             self.folder.run_once("frames", partial(self._extract_frames, source))
@@ -131,7 +118,7 @@ class _Job:
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
         first = next(iter(self.source.images.values()))
-        self.threads = options.threads or threads_for(first.width, first.height)
+        self.threads = options.threads or work.threads_for(first.width, first.height)
         kept = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
         self.folder.open("images", digest_of(self.source.fingerprint, options, _LATE), keep=kept)
         self.input = given or digest_of(self.source.fingerprint, options)
@@ -162,7 +149,7 @@ class _Job:
         for short, name in self.files.items():
             image, mask = self.source.images[name], self.source.masks.get(name)
             if not short.endswith(".panorama.png"):
-                link_or_copy(image.path, images / short)
+                work.link_or_copy(image.path, images / short)
             else:
                 Image.fromarray(decode(image.path)).save(images / short, compress_level=1)
             if self.source.masks:
@@ -171,10 +158,8 @@ class _Job:
         if self.options.accurate:
             sizes = sorted({(image.width, image.height) for image in self.source.images.values()})
             if len(sizes) > 1:
-                raise DataError(
-                    f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sizes)}); --accurate "
-                    "needs one: resize them, or omit it"
-                )
+                found = f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sizes)})"
+                raise DataError(f"{found}; --accurate needs one: resize them, or omit it")
             mask_files = {short: masks / f"{short}.png" for short in self.files} if self.source.masks else {}
             folders = self.work / "views", self.work / "view_masks"
             rig.render_views(self.paths, mask_files, *folders, partial(self.progress, "views"))
@@ -191,10 +176,8 @@ class _Job:
         """Group images that share a camera: panoramas of one size, or one view of all panoramas."""
         if self.options.accurate:
             lens = rig.view_lens(next(iter(self.source.images.values())).width)
-            return [
-                sfm.Group(tuple(rig.view_name(view, short) for short in self.files), lens.width, lens.height, lens.fx)
-                for view in range(self.views)
-            ]
+            names = [tuple(rig.view_name(view, short) for short in self.files) for view in range(self.views)]
+            return [sfm.Group(some, lens.width, lens.height, lens.fx) for some in names]
         by_size: dict[tuple[int, int], list[str]] = {}
         for short, image in zip(self.files, self.source.images.values(), strict=True):
             by_size.setdefault((image.width, image.height), []).append(short)
@@ -273,7 +256,7 @@ class _Job:
     def _progress(self, step: str, done: int, total: int) -> None:
         """Report a batch, and stop before the next one if the disk is full."""
         self.progress(step, done, total)
-        refuse_full(self.work)
+        work.refuse_full(self.work)
 
 
 def _suffix(image: ImageFile) -> str:

@@ -104,9 +104,8 @@ def _make(options: SyntheticOptions) -> Stored:
         else:
             images.append(camera.draw_stitched(world, pose, options.lens_gap * truth.median_depth, options))
     train = [index for index in range(len(images)) if index not in held_out]
-    points, colors = camera.sample_points(
-        truth.world, truth.poses[train], [images[index] for index in train], options, truth.random("points")
-    )
+    seen = [images[index] for index in train]
+    points, colors = camera.sample_points(truth.world, truth.poses[train], seen, options, truth.random("points"))
     points, poses = options.world_scale * points, truth.given_poses
     digest = hashlib.sha256(repr(sorted(held_out)).encode())
     for array in (*images, poses, points, colors):

@@ -78,10 +78,8 @@ def floor_lamp(x: float, y: float, height: float = 1.7) -> list[Shape]:
 def pendant(x: float, y: float, ceiling: float, drop: float) -> list[Shape]:
     """Return a glowing globe on a thin cord from the ceiling."""
     globe = Material(tx.stripes(((1, 0.98, 0.9), (1, 0.9, 0.7)), 0.05), glows=True)
-    return [
-        Sphere((x, y, ceiling - drop), 0.14, (globe,)),
-        Rod((x, y, ceiling - drop + 0.13), (x, y, ceiling), 0.008, metal((0.15, 0.15, 0.15))),
-    ]
+    cord = Rod((x, y, ceiling - drop + 0.13), (x, y, ceiling), 0.008, metal((0.15, 0.15, 0.15)))
+    return [Sphere((x, y, ceiling - drop), 0.14, (globe,)), cord]
 
 
 def plant(x: float, y: float, height: float, rng: np.random.Generator) -> list[Shape]:

@@ -166,7 +166,7 @@ def noise(folder, count=2):
 def test_unrelated_images_are_reported_and_refused_if_there_are_no_others(scene, tmp_path, monkeypatch):
     source, calls = noise(tmp_path / "in"), []
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "threads_for", lambda *size: calls.append(size) or 1)
+        patch.setattr(work, "threads_for", lambda *size: calls.append(size) or 1)
         with pytest.raises(DataError, match="no relative pose was found for any two of the 2 panoramas"):
             prepare(source, tmp_path / "out")
     assert not (tmp_path / "out").exists() and calls == [(128, 64)]
