@@ -46,8 +46,8 @@ def lenient(arguments: Sequence[str]) -> list[str]:
 
     >>> lenient(["method=padgs", "train.iteration=5", "+experiment=smoke", "-m", "seed=1,2"])
     ['method=padgs', '++train.iteration=5', '+experiment=smoke', '-m', '++seed=1,2']
-    >>> lenient(["scale=cpu"])
-    ['+scale=cpu']
+    >>> lenient(["scale=cpu", "scene_set=bar_cpu"])
+    ['+scale=cpu', 'scene_set=bar_cpu']
     """
     groups = _groups() | {"hydra"}
     has_experiment = any(argument.startswith("+experiment=") for argument in arguments)
@@ -99,7 +99,8 @@ def is_multirun(arguments: Sequence[str]) -> bool:
 
 def _groups() -> set[str]:
     folders = [path for path in (root() / "conf").iterdir() if path.is_dir()]
-    return {path.stem for path in (*folders, *(root() / "conf" / "variants").iterdir())}
+    tables = (root() / "conf" / "variants").iterdir()
+    return {"sweep", "scene_set", "method_set", "length_set", *(path.stem for path in (*folders, *tables))}
 
 
 def problem(arguments: Sequence[str]) -> str | None:
