@@ -25,7 +25,7 @@ ROUNDS = 8  # of densification
 DENSIFIED_SHARE = 0.4  # of the run, after which no Gaussians are added
 UNUSED = (  # options of 3DGS that have no effect here
     *("densify_from", "densify_until", "densify_every", "prune_by_extent", "prune_by_extent_from"),
-    *("reset_every", "reset_opacity"),
+    *("max_scale", "reset_every", "reset_opacity"),
 )
 LONG_RUN = 2000  # iterations; shorter runs have a higher threshold
 REFERENCE_PIXELS = 2 * 256 * 128 / math.pi  # pixels of equal solid angle; larger views have a lower threshold

@@ -161,8 +161,9 @@ def test_a_limit_of_seconds_does_not_end_the_rehearsal():
 
 
 def test_schedule_options_of_3dgs_are_refused():
-    with pytest.raises(ValueError, match="reset_every is 100, but padgs_plus has densification rounds of its own"):
-        PlusOptions(reset_every=100)
+    for option in ("reset_every", "max_scale"):
+        with pytest.raises(ValueError, match=f"{option} is 100, but padgs_plus has densification rounds of its own"):
+            PlusOptions(**{option: 100})
 
 
 def test_solid_angle_pixels():
