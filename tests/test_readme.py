@@ -163,3 +163,10 @@ def test_links_between_pages_and_to_files_exist():
     links = {(page, link) for page in pages for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())}
     missing = [f"{page}: {link}" for page, link in links if "://" not in link and not (page.parent / link).exists()]
     assert links and sorted(missing) == []
+
+
+def test_texts_are_short():
+    pages = [page for page in (ROOT / "docs").glob("*.md") if page.name != "findings.md"]  # which is made from runs
+    most = {ROOT / "README.md": 1200, **dict.fromkeys(pages, 1500)}
+    words = {page.name: len(page.read_text().split()) for page in most}
+    assert {page.name: words[page.name] for page, limit in most.items() if words[page.name] > limit} == {}
