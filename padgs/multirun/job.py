@@ -5,6 +5,7 @@ which asks all jobs to stop. Nothing else couples a job to its parent, so it run
 """
 
 import json
+import re
 import sys
 import time
 import traceback
@@ -197,6 +198,8 @@ def _message(error: Exception) -> str:
         key, _, value = error.override.lstrip("+").partition("=")
         rule = "values with spaces or any of ,;:{}[]()'\" need quotes"
         return f"{key}={value} cannot be read: {rule}, e.g. padgs-run '{key}=\"VALUE\"'"
+    if several := re.match("Ambiguous value for argument '(?:\\+\\+)?(.*)'\n", str(error)):
+        return f"{several[1]} has several values; give -m for one run each"
     return f"{error}\n{error.__cause__}" if isinstance(error, HydraException) and error.__cause__ else str(error)
 
 

@@ -136,6 +136,7 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, argum
             for argument, message in (
                 ("sede=5", "unknown key sede; known: data, render"),
                 ("method=omnigss", "did you mean omnigs?"),
+                ("seed=0,1", "seed=0,1 has several values; give -m for one run each"),
                 ("variant=a;b", "variant=a;b cannot be read: values with spaces or any of"),
                 ("iterations=5", "did you mean train.iterations?"),
                 ("method=foo", "unknown method 'foo'; known: crops_3dgs"),
