@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -155,17 +154,10 @@ def _check_images(capture: Capture, report: Report, progress: Progress) -> dict[
 
 def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
     """Build the scene; if that fails, retry without mask, split or points, to report all problems."""
-    relaxations: tuple[dict[str, Any], ...] = (
-        {},
-        {"mask": "none"},
-        {"split": "all"},
-        {"points": "random"},
-        {"mask": "none", "split": "all"},
-        {"mask": "none", "split": "all", "points": "random"},
-    )
-    for change in relaxations:
+    mask, split, points = {"mask": "none"}, {"split": "all"}, {"points": "random"}
+    for change in ({}, mask, split, points, mask | split, mask | split | points):
         try:
-            return assemble(capture, replace(options, **change))
+            return assemble(capture, replace(options, **change))  # type: ignore[arg-type]
         except DataError as error:
             if str(error) not in report.problems:
                 report.problems.append(str(error))

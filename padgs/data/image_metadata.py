@@ -14,6 +14,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms
 
 from padgs.data.capture import DataError
+from padgs.files import DAMAGE
 
 _ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
 _SRGB_GAMMA = 0.45455  # of the gAMA chunk of a PNG
@@ -64,7 +65,10 @@ def load_late_chunks(image: Image.Image, data: bytes) -> None:
 def refuse_rotated(image: Image.Image, path: object) -> None:
     """Refuse pixels that are stored rotated, by EXIF or XMP."""
     has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
-    by_exif = image.getexif().get(_ORIENTATION) if has_exif else 1
+    try:
+        by_exif = image.getexif().get(_ORIENTATION) if has_exif else 1
+    except DAMAGE as error:
+        raise DataError(f"{path} has EXIF data that cannot be read ({error}); {_REMOVE}") from error
     for source, orientation in {"EXIF": by_exif, "XMP": stated(_xmp(image), "Orientation")}.items():
         if str(orientation) not in ("None", "0", "1"):
             raise DataError(

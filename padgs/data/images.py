@@ -39,6 +39,7 @@ class ImageFile:
     digest: str
     crop: image_metadata.Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
     converted: bool = False  # whether other programs read other pixels, because the colours are not sRGB
+    format: str = ""  # of the content, which the suffix may not tell: JPEG, PNG, ...
 
 
 def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFile:
@@ -63,7 +64,7 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFi
     if _looks_cut(data) or may_be_transparent:
         _decode(data, path, "L" if mask else "RGB")
     digest = hashlib.sha256(data).hexdigest()
-    return ImageFile(path, *size, digest, crop, conversion is not None)
+    return ImageFile(path, *size, digest, crop, conversion is not None, image.format or "")
 
 
 @contextmanager

@@ -27,7 +27,7 @@ MIN_VISIBLE = 0.01  # of the sphere; with less, training has no signal and metri
 MAX_HIDDEN = 0.75  # share of the sphere that a sound mask hides at most: tripod, sky, what a part of a panorama lacks
 INVERTED = "dynamic_mask_"  # begins the names of instant-ngp's masks, in which 255 marks what to ignore
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
-_INVERT = "If white marks what to ignore in them, set data.mask=inverted"
+_MEANING = "in a mask 255 means use, 0 means ignore. If white marks what to ignore in them, set data.mask=inverted"
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def find_masks(
             )
         mask = Mask(StoredImage(path, width, height, store, "L"), fixed, inverted ^ path.name.startswith(INVERTED))
         if mask.file not in shown:
-            rule = f" of {frame.name}; in a mask 255 means use, 0 means ignore; {_INVERT}"
+            rule = f" of {frame.name}; {_MEANING}"
             shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule)
         masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}{':inverted' * mask.inverted}")
@@ -127,10 +127,8 @@ def find_masks(
         hides = f"the masks hide {hidden:.0%} of the sphere"
         if given == "auto":
             where = os.path.relpath(next(iter(inspected)), capture.folder).split(os.sep)[0]
-            raise DataError(
-                f"{hides}, in {listed(path.name for path in inspected)}; in a mask 255 means use, 0 means ignore. "
-                f"{_INVERT}; if that is meant, set data.mask={where}"
-            )
+            names = listed(path.name for path in inspected)
+            raise DataError(f"{hides}, in {names}; {_MEANING}; if that is meant, set data.mask={where}")
         notes.append(f"{hides}, as data.mask={given} says")
     return masks, digests, notes
 

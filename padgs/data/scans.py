@@ -71,28 +71,22 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
         optional_module("lazrs", path)
     # Of the decoders of LAZ, the parallel one ends the process if a damaged file states a chunk larger than memory.
     decoders = [decoder for decoder in laspy.LazBackend.detect_available() if decoder.name != "LazrsParallel"]
+    points, colors, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint16)], 0
     with _readable(path, "export it again as LAS 1.2 to 1.4"):
         _check_header(path)
-        points, colors, step = _las_points(laspy.open(path, laz_backend=decoders), path)
-    paint = None if colors is None else color_bytes(colors, str(path))
-    return _thinned(path, Cloud(torch.from_numpy(points), paint), step)
-
-
-def _las_points(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Return every `step`-th point [P, 3], its colours [P, 3] if there are any, and `step`."""
-    with reader as file:
-        step = -(-file.header.point_count // MOST_POINTS) or 1
-        coloured = set(CHANNELS) <= set(file.header.point_format.dimension_names)
-        points, colors, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint16)], 0
-        for chunk in file.chunk_iterator(CHUNK):
-            some = slice(-start % step, None, step)
-            points.append(np.stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)], axis=1)[some])
-            if coloured:
-                colors.append(np.stack([np.asarray(chunk[name]) for name in CHANNELS], axis=1)[some])
-            start += len(chunk)
-        if start != file.header.point_count:
-            raise DataError(f"{path} states {file.header.point_count} points but holds {start}; copy it again")
-    return np.concatenate(points), np.concatenate(colors) if coloured else None, step
+        with laspy.open(path, laz_backend=decoders) as file:
+            step = -(-file.header.point_count // MOST_POINTS) or 1
+            coloured = set(CHANNELS) <= set(file.header.point_format.dimension_names)
+            for chunk in file.chunk_iterator(CHUNK):
+                some = slice(-start % step, None, step)
+                points.append(np.stack([np.asarray(chunk[axis]) for axis in "xyz"], axis=1)[some])
+                if coloured:
+                    colors.append(np.stack([np.asarray(chunk[name]) for name in CHANNELS], axis=1)[some])
+                start += len(chunk)
+            if start != file.header.point_count:
+                raise DataError(f"{path} states {file.header.point_count} points but holds {start}; copy it again")
+    paint = color_bytes(np.concatenate(colors), str(path)) if coloured else None
+    return _thinned(path, Cloud(torch.from_numpy(np.concatenate(points)), paint), step)
 
 
 def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:

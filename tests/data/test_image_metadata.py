@@ -70,6 +70,12 @@ def test_a_part_of_a_panorama_is_padded(extension, elements, tmp_path):
     assert pixels.sum() == inside.sum()
 
 
+def test_unreadable_exif_is_no_damage_of_the_image(tmp_path):
+    PANORAMA.save(tmp_path / "a.png", exif=b"Exif\0\0no tags")
+    with pytest.raises(DataError, match=r"a.png has EXIF data that cannot be read .*remove the metadata \(`exiftool"):
+        inspect(tmp_path / "a.png")
+
+
 def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_part(tmp_path):
     larger = {name: value if isinstance(value, str) else 10.0 * value for name, value in GPANO.items()}
     PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**larger))

@@ -55,27 +55,20 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
     return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)
 
 
-_RICOH360_MODEL = "output_dir/colmap"
-
-
 def read_ricoh360(path: Path, options: DataOptions) -> Capture:
     """Read poses and points of a Ricoh360 scene."""
     images = image_folder(path, options.images, ("imgs", "images"))
-    mask = path / "imgs" / "mask.png"
-    file = path / _RICOH360_MODEL / "images.txt"
+    mask, model = path / "imgs" / "mask.png", path / "output_dir" / "colmap"
+    file = model / "images.txt"
     frames = []
     for image in read_images(file):
         name = check_name(image.name, str(file))
         pose = pose_of(image, f"{name} in {file}")
         frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
     cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
-    points = path / _RICOH360_MODEL / "points3D.txt"
-    if cloud is None and points.is_file():
-        cloud = read_points(points).cloud
+    if cloud is None and (model / "points3D.txt").is_file():
+        cloud = read_points(model / "points3D.txt").cloud
     return Capture("ricoh360", path, images, tuple(frames), cloud)
-
-
-_OMNIBLENDER_CLOUDS = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")
 
 
 def read_omniblender(path: Path, options: DataOptions) -> Capture:
@@ -90,7 +83,8 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
         matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
         pose = poses.cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
-    return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, _OMNIBLENDER_CLOUDS))
+    names = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")
+    return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, names))
 
 
 def read_ob3d(path: Path, options: DataOptions) -> Capture:
@@ -102,16 +96,11 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
         if len(cameras) != 1:
             raise DataError(f"{file} must hold a list of one camera; copy it again")
         camera, number = cameras[0], file.name.removesuffix("_cam.json")
-        pose = camera["extrinsics"]
-        depth = path / "depths" / f"{number}_depth.exr"
-        frames[number] = Frame(
-            f"{number}_rgb.png",
-            images / f"{number}_rgb.png",
-            poses.cam_from_world(pose["rotation"].numbers(3, 3), pose["translation"].numbers(3), str(file)),
-            camera["width"].whole(),
-            camera["height"].whole(),
-            depth=depth if depth.parent.is_dir() else None,
-        )
+        stated, name = camera["extrinsics"], f"{number}_rgb.png"
+        pose = poses.cam_from_world(stated["rotation"].numbers(3, 3), stated["translation"].numbers(3), str(file))
+        depth = path / "depths" / f"{number}_depth.exr" if (path / "depths").is_dir() else None
+        size = camera["width"].whole(), camera["height"].whole()
+        frames[number] = Frame(name, images / name, pose, *size, depth=depth)
     if not frames:
         raise DataError(f"{path / 'cameras'} holds no NNNNN_cam.json; give the folder Egocentric or Non-Egocentric")
     split = {}

@@ -261,9 +261,8 @@ class _Job:
 
 def _suffix(image: ImageFile) -> str:
     """Return the suffix of an image for pycolmap; another one if it must be decoded for it."""
-    suffix = image.path.suffix
-    is_read = suffix.lower() in sfm.IMAGE_SUFFIXES and image.crop is None and not image.converted
-    return suffix if is_read else ".panorama.png"
+    is_read = image.format != "WEBP" and image.crop is None and not image.converted
+    return image.path.suffix if is_read else ".panorama.png"
 
 
 def _pycolmap_message(error: Exception, log: Path) -> str:

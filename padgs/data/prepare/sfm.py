@@ -25,7 +25,6 @@ LOSS_SCALE = 1.0  # pixels, of the Cauchy loss in the final refinement
 MAX_ERROR = 4.0  # pixels; points with larger reprojection errors are dropped, as in the mapper
 MIN_ANGLE = 1.5  # degrees between the rays to a point
 _PAIRS_PER_BATCH = 64  # of images
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # that pycolmap reads
 
 
 @dataclass(frozen=True)

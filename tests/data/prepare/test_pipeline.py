@@ -182,10 +182,11 @@ def test_unrelated_images_are_reported_and_refused_if_there_are_no_others(scene,
 def test_a_result_inside_its_source_is_not_read_as_input(scene, tmp_path):
     """Use panoramas in a format that pycolmap cannot read."""
     for index in range(3):
-        Image.open(scene[1] / f"pano 00{index}.png").save(tmp_path / f"{index}.webp", lossless=True)
+        path = tmp_path / f"{index}.{'jpg' if index == 2 else 'webp'}"  # a browser may save WebP with another suffix
+        Image.open(scene[1] / f"pano 00{index}.png").save(path, "WEBP", lossless=True)
     result = prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1))
-    assert result.registered == ("0.webp", "1.webp", "2.webp")
-    assert [frame.image.suffix for frame in padgs.data.read(tmp_path / "flat").frames] == 3 * [".webp"]
+    assert result.registered == ("0.webp", "1.webp", "2.jpg")
+    assert [frame.image.suffix for frame in padgs.data.read(tmp_path / "flat").frames] == [".webp", ".webp", ".jpg"]
     shutil.copy(scene[1] / "pano 000.png", tmp_path / "flat" / "check.png")
     assert prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1)) == replace(result, seconds={})
 
