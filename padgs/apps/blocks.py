@@ -12,7 +12,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -269,7 +269,7 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
     scene = load_scene(config, start(config))
     store = RunStore.of(config, scene)
     with np.load(folder.parent / REGIONS, allow_pickle=False) as regions:
-        state = _joined(runs, numbers, regions["points"], regions["owner"], scene)
+        state = _joined(runs, numbers, regions, scene)
     with store:
         method = build_method(config)
         method.load_state(state)
@@ -330,13 +330,11 @@ def _refuse_other(run: LoadedRun, first: LoadedRun) -> None:
             raise ValueError(f"{run.folder} {trouble}")
 
 
-def _joined(
-    runs: Sequence[LoadedRun], numbers: Sequence[int], points: np.ndarray, owner: np.ndarray, scene: Scene
-) -> State:
+def _joined(runs: Sequence[LoadedRun], numbers: Sequence[int], regions: Mapping[str, Any], scene: Scene) -> State:
     """Return the state of a model of all Gaussians that lie in the blocks of their runs, in the world of the scene."""
     from scipy.spatial import KDTree
 
-    tree, parts = KDTree(points), []
+    tree, owner, parts = KDTree(regions["points"]), regions["owner"], []
     for run, number in zip(runs, numbers, strict=True):
         state = run.method.state().of_model()
         means = state.tensors["splats/means"].double().cpu() + run.scene.origin.cpu()
@@ -352,6 +350,4 @@ def _joined(
     values = model.values | {"scene_scale": scene.scale, "extent": scene.extent}
     values["active_degree"] = max(run.method.model.splats.active_degree for run in runs)
     others = {name: tensor for name, tensor in stored.tensors.items() if name.startswith("random/")}
-    return State(
-        {f"{MODEL}{name}": tensor for name, tensor in tensors.items()} | others, stored.values | {"model": values}
-    )
+    return State({f"{MODEL}{n}": t for n, t in tensors.items()} | others, stored.values | {"model": values})

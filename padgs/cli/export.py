@@ -11,9 +11,7 @@ def export(
     run: Run,
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html always does")
-    ] = False,
+    smooth: Annotated[bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html does")] = False,
     distillation_steps: Annotated[
         int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
     ] = None,

@@ -27,9 +27,7 @@ def report(
     scene: Annotated[list[str] | None, typer.Option(help="only these scenes or data sets, as a,b; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
     mix: Annotated[bool, typer.Option(help="compare runs of different rules, sizes, lengths and machines")] = False,
-    collect: Annotated[
-        bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
-    ] = False,
+    collect: Annotated[bool, typer.Option(help="add the runs to OUT/results.jsonl first, report on all in it")] = False,
     svg: Annotated[bool, typer.Option(help="write charts as SVG, too")] = False,
     strict: Annotated[bool, typer.Option(help="exit code 1 for unusable files or runs that do not compare")] = False,
 ) -> None:

@@ -48,6 +48,16 @@ def available() -> bool:
     return succeeds(library)
 
 
+@functools.lru_cache(maxsize=4)
+def workspace(size_of: str, height: int, width: int) -> torch.Tensor:
+    """Return scratch memory for images, of a size that a function of the library states.
+
+    Kept between iterations, because page faults of fresh memory cost more than a loss. Python threads share it, so only
+    one may train at a time.
+    """
+    return torch.zeros(getattr(library(), size_of)(height, width), dtype=torch.float32)
+
+
 def works_on(_: torch.device) -> bool:
     """Return whether the library is available; every CPU can run it."""
     return available()

@@ -56,9 +56,8 @@ def score_blocks(score: Callable[..., Removals], request: Request, target: Tenso
         part = vars(score(own, target[pixels].contiguous(), weight[pixels].contiguous()))
         found = found or {name: values.new_zeros(count) for name, values in part.items()}
         for name, values in part.items():  # the peak is the largest of the blocks, all else are sums over pixels
-            found[name][rows] = (
-                torch.maximum(found[name][rows], values) if name == "peak" else found[name][rows] + values
-            )
+            old = found[name][rows]
+            found[name][rows] = torch.maximum(old, values) if name == "peak" else old + values
     assert found is not None, "guaranteed by `check_inputs`: an image has pixels"
     return Removals(**found)
 

@@ -6,12 +6,12 @@ both images, so that no gradient comes from hidden pixels.
 """
 
 import ctypes
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from padgs.geometry.distortion import end_row_weight, solid_angle_weight
 from padgs.geometry.panorama import Device
@@ -146,37 +146,38 @@ def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda
     devices = {str(tensor.device): None for tensor in (image, target, weight, total)}
     if len(devices) > 1:
         raise ValueError(f"image, target, weight and total are on {', '.join(devices)}; bring them to one device")
-    return _FusedLoss.apply(image, target, weight, lambda_l1, total, EVALUATIONS[image.device.type])
+    height, width, _ = image.shape
+    drawn, target = image.detach().contiguous(), target.contiguous()
+    weight = weight.to(torch.float32).expand(height, width)
+
+    def evaluate(gradient: Tensor | None) -> Tensor:
+        arguments = LossArguments(width, height, pointer(drawn), pointer(target), weight.data_ptr(), *weight.stride())
+        arguments.lambda_l1, arguments.gradient = lambda_l1, pointer(gradient)
+        return EVALUATIONS[drawn.device.type](arguments, drawn, total)
+
+    return WithDerivative.apply(image, evaluate)
 
 
-class _FusedLoss(torch.autograd.Function):
+class WithDerivative(torch.autograd.Function):
+    """Scalar that a library computes together with its derivative by a tensor; a call fills that unless it is None."""
+
     @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor, evaluate: Callable
-    ) -> Tensor:
-        height, width, _ = image.shape
-        image, target = image.contiguous(), target.contiguous()
-        weight = weight.to(torch.float32).expand(height, width)
-        ctx.gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        arguments = LossArguments(width, height, pointer(image), pointer(target), weight.data_ptr(), *weight.stride())
-        arguments.lambda_l1, arguments.gradient = lambda_l1, pointer(ctx.gradient)
-        return evaluate(arguments, image, total)
+    def forward(ctx: Any, tensor: Tensor, call: Callable[[Tensor | None], Tensor]) -> Tensor:
+        """Return the scalar."""
+        ctx.gradient = tensor.new_empty(tensor.shape) if ctx.needs_input_grad[0] else None
+        return call(ctx.gradient)
 
     @staticmethod
-    def backward(ctx: Any, grad_loss: Tensor):
-        return ctx.gradient * grad_loss, None, None, None, None, None
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        """Return the gradient of the tensor."""
+        return ctx.gradient * grad, None
 
 
 def _on_cpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
-    arguments.normalizer, arguments.workspace = 1 / float(total), pointer(_workspace(*image.shape[:2]))
+    scratch = cpu.workspace("padgs_loss_workspace", *image.shape[:2])
+    arguments.normalizer, arguments.workspace = 1 / float(total), pointer(scratch)
     return image.new_tensor(cpu.library().padgs_photometric_loss(ctypes.byref(arguments)))
-
-
-@functools.lru_cache(maxsize=2)
-def _workspace(height: int, width: int) -> Tensor:
-    # Kept between iterations, because page faults of fresh memory cost more than the loss itself. Python threads share
-    # it, so only one may train at a time.
-    return torch.zeros(cpu.library().padgs_loss_workspace(height, width), dtype=torch.float32)
 
 
 def _on_gpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:

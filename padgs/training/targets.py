@@ -74,9 +74,7 @@ class Targets:
     ) -> None:
         """Load nothing yet; `weight` is a name of ROW_WEIGHTS, `depth` one of DEPTH_KINDS if depth maps are used."""
         if depth and not any(view.load_depth for view in views):
-            raise ValueError(
-                "train.depth_weight is not 0, but no training view has a depth map; put depths/ beside images/"
-            )
+            raise ValueError("train.depth_weight is not 0, but no training view has a depth map; put them into depths/")
         if depth == MEASURED and any(view.depth_is_relative for view in views):
             raise ValueError("train.depth_kind=measured, but depth maps are relative; set train.depth_kind=monocular")
         self._weight, self._device, self._coarse_share, self._depth = weight, device, coarse_share, depth

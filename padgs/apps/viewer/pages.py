@@ -295,13 +295,11 @@ def show_runs(server: Server, runs: Sequence[LoadedRun]) -> Iterator[dict[int, P
             page.close()
 
 
-def _update(
-    renderers: Sequence[RunRenderer], pages: dict[int, Page], lock: threading.Lock, ended: threading.Event
-) -> None:
+def _update(shown: Sequence[RunRenderer], pages: dict[int, Page], lock: threading.Lock, ended: threading.Event) -> None:
     """Redraw all pages whenever training has written a checkpoint."""
     while not ended.wait(UPDATE_SECONDS):
         with lock:
-            changed = [renderer.update() for renderer in renderers]
+            changed = [renderer.update() for renderer in shown]
         if any(changed):
             for page in list(pages.values()):
                 page.redraw()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.camera import Camera
+from padgs.geometry.panorama import Device
 from padgs.methods.egonerf.field import EgoNeRF
 from padgs.render import Rendering
 from padgs.scene import Scene, View
@@ -150,9 +151,7 @@ class Rays:
 class RayPixels:
     """All unmasked pixels of some views; 7 bytes per pixel, 11 if weights differ. `generator` makes random choices."""
 
-    def __init__(
-        self, views: Sequence[View], weight: str = "uniform", device: torch.device | str = "cpu", seed: int = 0
-    ) -> None:
+    def __init__(self, views: Sequence[View], weight: str = "uniform", device: Device = "cpu", seed: int = 0) -> None:
         """Load every view once; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         colors, places, weights = [], [], []
         tables: dict[Camera, tuple[int, Tensor]] = {}  # start among all directions, directions

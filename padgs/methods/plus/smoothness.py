@@ -8,20 +8,18 @@ On the CPU one native call computes value and derivative (csrc/cpu/roughness.cpp
 """
 
 import ctypes
-import functools
 import math
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from padgs.geometry.camera import Camera, Panorama
 from padgs.geometry.distortion import solid_angle_weight
 from padgs.native import cpu
 from padgs.native.abi import RoughnessArguments, pointer
 from padgs.render import Rendering
+from padgs.training.loss import WithDerivative
 
 EDGE_DECAY = 10.0  # weight exp(-EDGE_DECAY x second difference of the brightness): e^-1 at 0.1
 MAX_BEND = 0.1  # relative second difference beyond which there is an edge, without gradient
@@ -46,8 +44,16 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float, far: float =
     if wraps:
         rows = solid_angle_weight(len(depth), dtype=depth.dtype, device=depth.device)
     if fits_native(rendering):
-        inputs = (depth, rendering.image, rendering.transmittance, rows)
-        return _Roughness.apply(*inputs, wraps, near, EDGE_DECAY, MAX_BEND)
+        height, width = depth.shape
+        parts = (rendering.image, rendering.transmittance, depth, rows)
+        inputs = [part.detach().contiguous() for part in parts]
+
+        def evaluate(gradient: Tensor | None) -> Tensor:
+            tensors = map(pointer, (*inputs, cpu.workspace("padgs_roughness_workspace", height, width), gradient))
+            arguments = RoughnessArguments(width, height, wraps, near, EDGE_DECAY, MAX_BEND, *tensors)
+            return inputs[0].new_tensor(cpu.library().padgs_roughness(ctypes.byref(arguments)))
+
+        return WithDerivative.apply(depth, evaluate)
     return define_roughness(rendering, rows, wraps=wraps, near=near)
 
 
@@ -88,27 +94,3 @@ def fits_native(rendering: Rendering) -> bool:
     plain = all(part.device.type == "cpu" and part.dtype == torch.float32 for part in parts)
     alike = rendering.transmittance.shape == shape and rendering.image.shape == (*shape, 3)
     return plain and alike and min(shape) >= MIN_SIDE and cpu.available()
-
-
-class _Roughness(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, depth: Tensor, image: Tensor, transmittance: Tensor, rows: Tensor, wraps: bool, *scalars: float
-    ) -> Tensor:
-        height, width = depth.shape
-        inputs = [tensor.contiguous() for tensor in (image, transmittance, depth, rows)]
-        ctx.gradient = torch.empty_like(inputs[2]) if ctx.needs_input_grad[0] else None
-        tensors = map(pointer, (*inputs, _workspace(height, width), ctx.gradient))
-        arguments = RoughnessArguments(width, height, wraps, *scalars, *tensors)
-        return depth.new_tensor(cpu.library().padgs_roughness(ctypes.byref(arguments)))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor):
-        return ctx.gradient * grad_loss, *[None] * 7
-
-
-@functools.lru_cache(maxsize=2)
-def _workspace(height: int, width: int) -> Tensor:
-    # Reused like the one of `padgs.training.loss`: only one thread at a time may train.
-    return torch.zeros(cpu.library().padgs_roughness_workspace(height, width), dtype=torch.float32)

@@ -138,20 +138,18 @@ class SplatModel:
         self.pruning.done = True
         return (f"pruned the least important of {before} Gaussians, kept {kept}",)
 
-    def _update_filter(
-        self, smoothing: SmoothingFilter, iteration: int, optimizer: torch.optim.Adam
-    ) -> tuple[str, ...]:
+    def _update_filter(self, smooth: SmoothingFilter, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Update the filter after rows changed and at least once a round; at the end prune what is invisible."""
         splats, every = self.splats, self.densifier.options.densify_every
-        if len(smoothing.variances) == len(splats) and iteration % every and iteration < self.iterations:
+        if len(smooth.variances) == len(splats) and iteration % every and iteration < self.iterations:
             return ()
-        smoothing.update(splats.means)
+        smooth.update(splats.means)
         if iteration < self.iterations:
             return ()
         visible, before = self._rendered_opacities() >= ALPHA_MIN, len(splats)
         keep_rows(splats.rows(), optimizer, visible)
         self.densifier.reset_statistics()
-        smoothing.update(splats.means)
+        smooth.update(splats.means)
         return (f"pruned {before - len(splats)} invisible Gaussians",)
 
     def degree_at(self, iteration: int) -> int:
