@@ -35,11 +35,9 @@ class EgoNeRFMethod(Method):
         raise ValueError("egonerf has no Gaussians to prune, so it has no smallest model; take a method with Gaussians")
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
-        """See `Method.build_model`."""
         return EgoNeRFModel(EgoNeRF.from_scene(scene, self.options, self.seed), iterations)
 
     def restore(self, state: State) -> EgoNeRFModel:
-        """See `Method.restore`."""
         stored = state.of_model()
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
         model = EgoNeRF(self.options, centre, *(stored.values[name] for name in ("unit", "travel", "kind")))
@@ -47,7 +45,6 @@ class EgoNeRFMethod(Method):
         return EgoNeRFModel(model, 1)
 
     def build_trainer(self, model: EgoNeRFModel, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
-        """See `Method.build_trainer`."""
         return RayTrainer(model, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:

@@ -36,7 +36,6 @@ class OP43DGSModel(SplatModel):
     options: OP43DGSOptions
 
     def render_options(self, view: View) -> RenderOptions:
-        """Return the renderer options for a view."""
         options = super().render_options(view)
         if not self.options.fixed_low_pass:
             return options

@@ -99,7 +99,6 @@ class Cubemap3DGSMethod(SplatMethod):
         return square_lens(panorama, 1.0, FINENESS)
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
-        """See `Method.build_trainer`."""
         each = self._views_per_step
         return Trainer(model, scene, budget, self.train_options, self.seed, views_each=each, stage=stage)
 

@@ -37,7 +37,6 @@ class SCOmniGSModel(SplatModel):
     options: SCOmniGSOptions
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
-        """Render all Gaussians, differentiably."""
         drawing, options = super().draw(view, mean_offsets), self.options
         penalty = options.anisotropy_weight * anisotropy(drawing.gaussians.scales, options.anisotropy_ratio)
         return replace(drawing, penalty=penalty)

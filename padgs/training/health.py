@@ -213,11 +213,8 @@ class EarlyStopping:
     """Ends a run when validation views gain nothing; they are trained on during the final fade.
 
     A stopped run jumps to the last `FADE` of its schedule, in which learning rates fall, and ends like any other.
-
-    Attributes:
-        held_out: indices of the validation views; empty if the budget does not stop early.
-        fade: schedule step from which the run fades.
-        state: measurements so far, as JSON.
+    `held_out` are the indices of the validation views, none if the budget does not stop early; `fade` is the schedule
+    step from which the run fades, `state` the measurements so far, as JSON.
     """
 
     def __init__(self, views: Sequence[View], budget: Budget) -> None:

@@ -70,12 +70,10 @@ class Method(ABC):
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
         """Train from the scene's point cloud, a warm start or a loaded state; yield a record per iteration.
 
-        The caller may stop between two records and call `state()` then. With a budget of seconds, a few steps are taken
-        first and thrown away; they fix the length of the schedule. They and building the initial model count as
-        training time. `stage` is entered with the name of each part of an iteration, see `Trainer`.
-
-        A ValueError says at once that the method cannot train on this scene or within this budget; a Failure during
-        training ends the run with a status other than ok.
+        The caller may stop between two records and call `state()` then. With a budget of seconds, a few steps that are
+        thrown away fix the length of the schedule; they and building the initial model count as training time. `stage`
+        is entered with the name of each part of an iteration. A ValueError says at once that the method cannot train on
+        this scene or within this budget; a Failure during training ends the run with a status other than ok.
         """
         lap = Lap()
         if not scene.train:

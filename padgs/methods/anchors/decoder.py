@@ -11,13 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from padgs.gaussians import Gaussians
-from padgs.methods.anchors.native_decoder import (
-    COLOR_VALUES,
-    COVARIANCE_VALUES,
-    OPACITY_VALUES,
-    decode_on_cpu,
-    decode_on_gpu,
-)
+from padgs.methods.anchors import native_decoder
+from padgs.methods.anchors.native_decoder import COLOR_VALUES, COVARIANCE_VALUES, OPACITY_VALUES
 from padgs.native import cpu, library_for
 
 
@@ -68,10 +63,10 @@ def decode_gaussians(
         return *define_gaussians(weights, anchors), None
     flat = tuple(tensor for head in weights for tensor in head)
     if library is cpu:
-        *values, slots, raw = decode_on_cpu(flat, *anchors)
+        *values, slots, raw = native_decoder.decode_on_cpu(*anchors, *flat)
         return Gaussians(*values), slots, raw, None
     capacity = None if capacity is None else min(capacity, anchors.offsets[..., 0].numel())
-    *values, slots, raw, count = decode_on_gpu(flat, *anchors, capacity=capacity)
+    *values, slots, raw, count = native_decoder.decode_on_gpu(capacity, *anchors, *flat)
     return Gaussians(*values), slots, raw, None if capacity is None else count
 
 

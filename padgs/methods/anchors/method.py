@@ -121,7 +121,6 @@ class AnchorModel:
         self.growth.observe(drawing.raw_opacities, drawing.slots, gradient, drawing.rendering.visible, iteration)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Grow and prune anchors."""
         return self.growth.adapt(iteration, optimizer)
 
     def parts(self, view: View) -> Parts:
@@ -130,24 +129,19 @@ class AnchorModel:
         return Parts(decoded.gaussians, decoded.slots, self.anchors.options.offsets, self._options)
 
     def keep(self, rows: Tensor) -> None:
-        """Keep these anchors only."""
         self.growth.keep(rows, None)
 
     def prune(self, count: int, views: Sequence[View]) -> None:
-        """Keep the `count` anchors that are most important to the views."""
         self.keep(most_important(importance_scores(self, views), count))
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
-        """Render a view without gradients."""
         return render(self.anchors.decode(view).gaussians, view, self._options, backend=self._backend)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of anchors."""
         return {"anchors": len(self.anchors)}
 
     def size(self) -> Size:
-        """Return the numbers of anchors and Gaussians, and the bytes of the stored model."""
         anchors = self.anchors
         counts = {"anchors": len(anchors), "gaussians": len(anchors) * anchors.options.offsets}
         return Size.of(counts, anchors.parameters(), stored=anchors.state_dict().values())
@@ -159,7 +153,6 @@ class AnchorModel:
         return State(self.anchors.state_dict() | tensors, {name: getattr(self.anchors, name) for name in LENGTHS})
 
     def load_state(self, state: State) -> None:
-        """Restore the model that `state` was taken of, whatever its number of anchors."""
         self.load_model(state)
         for name in self.growth.statistics:
             self.growth.statistics[name] = state.tensors[f"growth/{name}"].to(self.anchors.positions.device, copy=True)
@@ -202,7 +195,6 @@ class PaDGSMethod(Method):
             raise ValueError("budget.gaussians is auto, which prunes Gaussians, but PaD-GS has anchors; set a number")
 
     def build_model(self, scene: Scene, iterations: int) -> AnchorModel:
-        """See `Method.build_model`."""
         extent = self.options.extent_of(scene)
         extent /= scene.scale if self.options.offset_rate_unit == "scene" else 1.0
         anchors = PaDGS.from_scene(scene, self.options, seed=self.seed)
@@ -215,7 +207,6 @@ class PaDGSMethod(Method):
         return self._model_of(anchors, extent, iterations)
 
     def restore(self, state: State) -> AnchorModel:
-        """See `Method.restore`."""
         stored = state.of_model()
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
         lengths = {name: stored.values[name] for name in LENGTHS}

@@ -23,14 +23,6 @@ ALIGNMENT = 8  # rows of inputs are padded with zeros to a multiple: cuBLAS is s
 CHUNK = 4096  # anchors in one part of a product that sums over anchors
 
 
-def decode_on_cpu(weights: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
-    """Return means, quaternions, scales, opacities, colours, slots and raw opacities of the selected Gaussians.
-
-    `weights` are the networks' twelve tensors, `tensors` the fields of `SeenAnchors`; differentiable by all floats.
-    """
-    return _DecodeOnCPU.apply(*tensors, *weights)
-
-
 class _DecodeOnCPU(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features, seen, positions, offsets, log_scales, attenuation, *weights):
@@ -75,6 +67,11 @@ class _DecodeOnCPU(torch.autograd.Function):
         return grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
 
 
+# From the fields of `SeenAnchors` and the networks' twelve tensors, differentiably: means, quaternions, scales,
+# opacities, colours, slots and raw opacities of the selected Gaussians.
+decode_on_cpu = _DecodeOnCPU.apply
+
+
 def decode_arguments(
     constants: Sequence[Tensor],
     raw: Tensor,
@@ -89,15 +86,6 @@ def decode_arguments(
     hidden, width = weights[0].shape if weights else (0, 0)
     buffers = (inputs, *constants, raw, starts, slots, *outputs)
     return DecodeArguments(*raw.shape, width, hidden, *heads, *map(pointer, buffers))
-
-
-def decode_on_gpu(weights: tuple[Tensor, ...], *tensors: Tensor, capacity: int | None = None) -> tuple[Tensor, ...]:
-    """Return `decode_on_cpu` and the number of selected Gaussians, [1] int64.
-
-    The result has `capacity` rows: the selected Gaussians up to it, then zeros with slots of Gaussians that are not
-    selected. None: as many rows as are selected, a number that the host waits for.
-    """
-    return _DecodeOnGPU.apply(capacity, *tensors, *weights)
 
 
 class _DecodeOnGPU(torch.autograd.Function):
@@ -162,6 +150,11 @@ class _DecodeOnGPU(torch.autograd.Function):
         of_weights = [grad for head in zip(of_w1, of_b1, of_w2, of_b2, strict=True) for grad in head]
         grad_features = grad_hidden @ w1[:, : ctx.features]
         return None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
+
+
+# As on the CPU, after a capacity, and with the number of selected Gaussians, [1] int64. The result has `capacity` rows:
+# the selected Gaussians up to it, then zeros with slots of others; None: as many as are selected, which the host reads.
+decode_on_gpu = _DecodeOnGPU.apply
 
 
 def summed_products(left: Tensor, right: Tensor) -> Tensor:

@@ -32,7 +32,6 @@ class EgoNeRFModel:
         self.field, self._options, self._iterations = field, field.options, iterations
 
     def groups(self) -> list[ParameterGroup]:
-        """Return all parameters with their learning rates."""
         return [
             ParameterGroup(name, tuple(part.parameters()), self._decaying(RATES[name]))
             for name, part in self.field.named_children()
@@ -54,11 +53,9 @@ class EgoNeRFModel:
         return VARIATION_FACTOR * self._decaying(1.0)(iteration) * weighted
 
     def counts(self) -> dict[str, int]:
-        """Return the number of parameters."""
         return {"parameters": sum(p.numel() for p in self.field.parameters())}
 
     def render(self, view: View) -> Rendering:
-        """Render a view without gradients."""
         return self.field.render(view)
 
     def summary(self) -> str:
@@ -67,7 +64,6 @@ class EgoNeRFModel:
         return f"{self.field.kind} constants: {', '.join(f'{name} {value}' for name, value in values)}"
 
     def size(self) -> Size:
-        """Return parameters and their bytes."""
         return Size.of({}, self.field.parameters(), stored=self.field.parameters())
 
     def state(self) -> State:

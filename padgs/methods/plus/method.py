@@ -124,10 +124,8 @@ class PlusMethod(SplatMethod):
 
     @property
     def has_smoothing_filter(self) -> bool:
-        """See `padgs.methods.splats.smoothing_filter`."""
         return self.model.has_smoothing_filter
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
-        """See `Method.build_trainer`."""
         share = self.options.coarse_share if len(scene.train) > 1 else 0.0  # a rehearsal has one view, of usual size
         return Trainer(model, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)

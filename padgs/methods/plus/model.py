@@ -110,7 +110,6 @@ class PlusModel(SplatModel):
         self._step = self.iterations
 
     def load_state(self, state: State) -> None:
-        """Restore the model that `state` was taken of."""
         super().load_state(state)
         self._step, self._cameras, self._finest = state.values["step"], state.tensors[CAMERAS], None
 

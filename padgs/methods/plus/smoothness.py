@@ -30,9 +30,7 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float, far: float =
     """Return the mean of |second difference of 1 / r| / (1 / r) across and down, a scalar.
 
     Differentiable by `rendering.depth` only. Pixels are weighted by solid angle, by the opacity along all three rays,
-    and less where the brightness bends. For cameras other than panoramas all pixels weigh the same and rows do not
-    wrap.
-
+    and less where the brightness bends; for cameras other than panoramas they weigh the same and rows do not wrap.
     `near` > 0 is the lower limit of distances, in the unit of the depth. Beyond the distance `far`, the opacity counts
     times far / r: no view resolves the surface of the sky.
     """

@@ -92,7 +92,6 @@ class SplatMethod(Method):
             )
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
-        """See `Method.build_model`."""
         options = self.options
         shares = (options.initial_per_pixel, options.limit_per_pixel, options.depth_init_per_pixel or None)
         pixels = room_count(scene) * solid_angle_pixels(scene.train[0]) if any(shares) else 0.0
@@ -136,7 +135,6 @@ class SplatMethod(Method):
         return requested if requested is None or self.options.prune_psnr is None else GROWN_PER_KEPT * requested
 
     def restore(self, state: State) -> SplatModel:
-        """See `Method.restore`."""
         stored = state.of_model()
         values, empty = stored.values, stored.tensors["splats/means"][:0]
         splats = Splats(empty, empty, empty, degree=self.options.sh_degree, scene_scale=values["scene_scale"])

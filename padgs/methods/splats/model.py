@@ -104,7 +104,6 @@ class SplatModel:
         return gaussians if self._filter is None else self._filter(gaussians)
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
-        """Collect positional gradients."""
         assert drawing.mean_offsets.grad is not None, "observe is called after draw and backward"
         self.densifier.observe(drawing.mean_offsets.grad, drawing.rendering.visible, iteration)
 
@@ -157,7 +156,6 @@ class SplatModel:
         return iteration // scaled(DEGREE_EVERY, self.iterations)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of Gaussians."""
         return {"gaussians": len(self.splats)}
 
     def parts(self, view: View) -> Parts:
@@ -166,19 +164,16 @@ class SplatModel:
         return Parts(self._final_gaussians(view), slots, 1, self.render_options(view))
 
     def keep(self, rows: Tensor) -> None:
-        """Keep these Gaussians only."""
         keep_rows(self.splats.rows(), None, rows)
         self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
         if self._filter is not None:
             self._filter.variances = self._filter.variances[rows]
 
     def prune(self, count: int, views: Sequence[View]) -> None:
-        """Keep the `count` Gaussians that are most important to the views."""
         self.keep(most_important(importance_scores(self, views), count))
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
-        """Render a view without gradients."""
         return self._rendered(self._final_gaussians(view), view)
 
     def _final_gaussians(self, view: View) -> Gaussians:
@@ -191,7 +186,6 @@ class SplatModel:
         return self.splats if self._filter is None else widened(self.splats, self._filter.variances)
 
     def size(self) -> Size:
-        """Return counts and bytes of the model."""
         return Size.of(self.counts(), self.splats.parameters(), stored=self.splats.parameters())
 
     def state(self) -> State:
@@ -212,7 +206,6 @@ class SplatModel:
         return State(tensors, values)
 
     def load_state(self, state: State) -> None:
-        """Restore the model that `state` was taken of."""
         self.load_model(state)
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}

@@ -30,7 +30,7 @@ def on_gpu(
         return decode_gaussians(weights, anchors, capacity)
     flat, rows = tuple(tensor for head in weights for tensor in head), anchors.offsets[..., 0].numel()
     capacity = None if capacity is None else min(capacity, rows)
-    *values, slots, raw, count = decode_on_gpu(flat, *anchors, capacity=capacity)
+    *values, slots, raw, count = decode_on_gpu(capacity, *anchors, *flat)
     return Gaussians(*values), slots, raw, count
 
 
