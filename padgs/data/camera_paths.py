@@ -10,6 +10,10 @@ from torch import Tensor
 from padgs.data.capture import natural_key
 from padgs.scene import Scene
 
+SMOOTHING = 0.5  # standard deviation, in mean distances of neighbouring training cameras
+ORBIT_RADIUS = 0.4  # in camera radii of the scene
+SINGLE_CENTER_RADIUS = 0.1  # of orbit and dolly if all cameras share one centre, in scene scales
+
 
 @dataclass(frozen=True)
 class Gravity:
@@ -56,11 +60,6 @@ def centers(poses: Tensor) -> Tensor:
 
 def _degrees(cosine: Tensor) -> float:
     return torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).item()
-
-
-SMOOTHING = 0.5  # standard deviation, in mean distances of neighbouring training cameras
-ORBIT_RADIUS = 0.4  # in camera radii of the scene
-SINGLE_CENTER_RADIUS = 0.1  # of orbit and dolly if all cameras share one centre, in scene scales
 
 
 def interpolate_poses(poses: Tensor, times: Sequence[float] | np.ndarray) -> Tensor:

@@ -59,16 +59,13 @@ def first_of(folder: Path, names: Iterable[str], kind: Callable[[Path], bool] = 
     return next((there[name.casefold()] for name in names if name.casefold() in there), None)
 
 
-_NUMBER = re.compile(r"(\d+)")
-
-
 def natural_key(name: str) -> tuple[list[Any], str]:
     """Return a sort key that orders numbers in names by value.
 
     >>> sorted(["view_10", "view_2", "door"], key=natural_key)
     ['door', 'view_2', 'view_10']
     """
-    parts: list[Any] = _NUMBER.split(name)
+    parts: list[Any] = re.split(r"(\d+)", name)
     parts[1::2] = map(int, parts[1::2])
     return parts, name
 

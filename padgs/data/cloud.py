@@ -18,6 +18,9 @@ CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, afte
 PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
 SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 1/2 + SH_C0 f_dc
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0
+RANDOM_POINTS = 100_000
+RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
+GREY = 128
 
 
 def read_ply(path: Path) -> Cloud:
@@ -117,11 +120,6 @@ def joined(clouds: Sequence[Cloud]) -> Cloud:
     colors = [cloud.colors for cloud in clouds if cloud.colors is not None]
     points = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(cloud.points for cloud in clouds)])
     return Cloud(points, torch.cat(colors) if colors and len(colors) == len(clouds) else None)
-
-
-RANDOM_POINTS = 100_000
-RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
-GREY = 128
 
 
 def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:

@@ -27,6 +27,8 @@ VIEWS = 8
 SMALL = 256  # width at which colours are compared
 MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
 MIN_CORRELATION = 0.3  # of the colours of points and images that agree
+DARKEST, BRIGHTEST = 8, 250  # pixel values that are not clipped
+ROUNDS = 10  # of alternating medians, until convergence
 
 
 class Convention(NamedTuple):
@@ -111,7 +113,9 @@ def known_conventions() -> list[Convention]:
     corrections: dict[str, Callable[[Tensor], Tensor]] = {
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
-        "the rotations are transposed: transpose them and keep the centres": _transposed,
+        "the rotations are transposed: transpose them and keep the centres": lambda p: _with(
+            p, -p[:, :3, :3].mT @ centers(p)[..., None], p[:, :3, :3].mT
+        ),
         "the translations are camera centres: use t = -R t": lambda p: _with(p, -p[:, :3, :3] @ p[:, :3, 3:]),
         "the camera centres are translations: use C = -R^T C": lambda p: _with(p, centers(p)[..., None]),
         "the quaternions are in the order x y z w: write them as w x y z": _reordered,
@@ -140,11 +144,6 @@ def _signed_axes() -> Iterator[tuple[str, Tensor]]:
         yield words + (", which mirrors" if torch.linalg.det(matrix) < 0 else ""), matrix
 
 
-def _transposed(poses: Tensor) -> Tensor:
-    transposed = poses[:, :3, :3].mT
-    return _with(poses, -transposed @ centers(poses)[..., None], transposed)
-
-
 def _reordered(poses: Tensor) -> Tensor:
     """Return poses whose quaternion (w, x, y, z) was stated as x y z w; mirrored poses have none and are returned."""
     from scipy.spatial.transform import Rotation
@@ -159,10 +158,6 @@ def _with(poses: Tensor, translation: Tensor, rotation: Tensor | None = None) ->
     out = poses.clone()
     out[:, :3, :3], out[:, :3, 3:] = poses[:, :3, :3] if rotation is None else rotation, translation
     return out
-
-
-DARKEST, BRIGHTEST = 8, 250  # pixel values that are not clipped
-ROUNDS = 10  # of alternating medians, until convergence
 
 
 def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:

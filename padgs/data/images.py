@@ -27,6 +27,11 @@ _GREY = ("1", "L", "LA", "La")
 _ALPHA = ("RGBA", "RGBa", "LA", "La", "PA")
 GREY = 128  # libjpeg fills missing rows with it
 FILLING = b"\x55" * 2048  # decodes to a few pixels of a JPEG scan
+# Detection of dual-fisheye images: radii are relative to half the side of each circle's square.
+FISHEYE_ROWS = 128  # sampled
+OUTSIDE, RIM = 1.06, (0.7, 0.9)
+BLACK = 24  # largest pixel value that counts as black
+MIN_BLACK_OUTSIDE, MAX_BLACK_RIM = 0.98, 0.5  # shares of the pixels
 
 
 @dataclass(frozen=True)
@@ -210,13 +215,6 @@ def _misses_pixels(image: Image.Image, data: bytes, pixels: NDArray[np.uint8]) -
     end = data.rfind(b"\xff\xd9")
     with open_image(BytesIO(data[:end] + FILLING + data[end:])) as longer:
         return not np.array_equal(np.array(longer.convert("RGB" if pixels.shape[-1] == 3 else "L")), pixels)
-
-
-# Detection of dual-fisheye images: radii are relative to half the side of each circle's square.
-FISHEYE_ROWS = 128  # sampled
-OUTSIDE, RIM = 1.06, (0.7, 0.9)
-BLACK = 24  # largest pixel value that counts as black
-MIN_BLACK_OUTSIDE, MAX_BLACK_RIM = 0.98, 0.5  # shares of the pixels
 
 
 def refuse_dual_fisheye(pixels: NDArray[np.uint8], path: Path) -> None:

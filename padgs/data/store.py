@@ -84,14 +84,14 @@ class Decodable(Protocol):
 
 
 class ImageStore:
-    """Least-recently-used cache of decoded images, bounded in bytes. Thread-safe."""
+    """Least-recently-used cache of decoded images: `limit_bytes` of pixels on `device`, and all in `folder` if given.
+
+    It is thread-safe. With `threads` = 0 nothing is prefetched.
+    """
 
     def __init__(
         self, limit_bytes: int = 1 << 30, threads: int = 2, device: str = "cpu", folder: Path | None = None
     ) -> None:
-        """Keep `limit_bytes` of pixels on `device`, and all in `folder` if given; with `threads` = 0 nothing is
-        prefetched.
-        """
         self.limit_bytes, self.threads, self.device, self.folder = limit_bytes, threads, device, folder
         self.bytes = 0
         self.decoded = 0  # number of decoded images
@@ -110,11 +110,9 @@ class ImageStore:
             if image in self._kept:
                 self._kept.move_to_end(image)
                 return self._kept[image]
-            future = self._pending.get(image)
-            mine = future is None
-            if future is None:
-                future = self._pending[image] = Future()
-        if mine:
+            is_mine = image not in self._pending
+            future = self._pending.setdefault(image, Future())
+        if is_mine:
             self._fill(image, future)
         return future.result()
 
@@ -125,9 +123,7 @@ class ImageStore:
                 return
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="padgs-prefetch")
-            future: Future[Tensor] = Future()
-            self._pending[image] = future
-            self._pool.submit(self._fill, image, future)
+            self._pool.submit(self._fill, image, self._pending.setdefault(image, Future()))
 
     def _fill(self, image: Decodable, future: Future[Tensor]) -> None:
         """Decode into the cache; an error is raised where the future's result is used."""

@@ -13,6 +13,8 @@ FARTHEST = 1e15  # world units, the limit of renderers (`padgs.render.contract`)
 
 # `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
 OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenGL: y up, z backward
+# Camera axes (right, down, forward) in the frame of scanners: x forward, y left, z up.
+PANORAMA_FROM_CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 
 
 def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
@@ -53,10 +55,6 @@ def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
 def cam_from_opengl_pose(world_from_cam: Tensor, where: str) -> Tensor:
     """Return the pose [4, 4] of a world-from-cam matrix [3 or 4, 4] of an OpenGL camera: x right, y up, z backward."""
     return rigid(OPENCV_FROM_OPENGL, torch.zeros(3, dtype=torch.float64)) @ cam_from_pose(world_from_cam, where)
-
-
-# Camera axes (right, down, forward) in the frame of scanners: x forward, y left, z up.
-PANORAMA_FROM_CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 
 
 def cam_from_panorama(quaternion: Tensor, center: Tensor, where: str) -> Tensor:

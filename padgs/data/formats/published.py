@@ -32,6 +32,9 @@ from padgs.data.formats.colmap_files import read_images, read_points
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.splits import LISTS, check_name, read_lines, read_list
 
+# Body axes (x ahead, y right, z down) of TartanAir's camera axes x, y and z: its panoramas are turned by 90 degrees.
+_BODY_FROM_CAMERA = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
     """Read poses, split and points of a 360Roam scene."""
@@ -113,10 +116,6 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
     depth, cloud = DepthMeaning("ray", 1.0, "OB3D"), first_ply(path, ("sparse/sparse.ply",))
     name = "_".join(path.absolute().parts[-2:])
     return Capture("ob3d", path, images, tuple(frames.values()), cloud, split or None, depth=depth, name=name)
-
-
-# Body axes (x ahead, y right, z down) of the camera's x, y and z: the panoramas are turned by 90 degrees.
-_BODY_FROM_CAMERA = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
 
 
 def read_tartanair(path: Path, options: DataOptions) -> Capture:

@@ -22,6 +22,15 @@ from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # raw files of 360-degree cameras
+UNSUPPORTED = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
+_NOT_STITCHED = "is not stitched: export panoramas, or a 2:1 video, with the camera's own program"
+_WAYS_OUT = (  # suffixes of unsupported files, and what to do with them
+    (UNSTITCHED, _NOT_STITCHED),
+    (UNSUPPORTED, "is an image in an unsupported format: convert all such images to JPEG"),
+    (VIDEO_EXTENSIONS, "is a video: give its own path, not that of its folder"),
+)
+DECODED = 3  # images checked for dual fisheye; images of one camera are alike
 _HDR_TRANSFER = {8: "linear", 16: "PQ", 18: "HLG"}  # numbers of ITU-T H.273
 _ONE_PANORAMA = {  # of FFmpeg's metadata of frames: first numbers, and what to do with a video that has others
     "SPHERICAL": ((0,), "in another projection than equirectangular: convert it"),
@@ -109,17 +118,6 @@ def sharpness(frame: NDArray[np.uint8]) -> float:
     gray = frame[::2, ::2, 1].astype(np.int16)
     around = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:]
     return float(np.abs(4 * gray[1:-1, 1:-1] - around).mean())
-
-
-UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # raw files of 360-degree cameras
-UNSUPPORTED = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
-_NOT_STITCHED = "is not stitched: export panoramas, or a 2:1 video, with the camera's own program"
-_WAYS_OUT = (  # suffixes of unsupported files, and what to do with them
-    (UNSTITCHED, _NOT_STITCHED),
-    (UNSUPPORTED, "is an image in an unsupported format: convert all such images to JPEG"),
-    (VIDEO_EXTENSIONS, "is a video: give its own path, not that of its folder"),
-)
-DECODED = 3  # images checked for dual fisheye; images of one camera are alike
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def draw(
         image[np.ix_(rows, columns)] = np.clip(mean * 255 + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
     _ = world.light_maps  # baked once, before the threads
-    with ThreadPoolExecutor(workers()) as pool:  # numpy releases the interpreter lock
+    with ThreadPoolExecutor(min(8, cores())) as pool:  # numpy releases the interpreter lock
         list(pool.map(fill, blocks))
     return image
 
@@ -72,11 +72,6 @@ def trace(world: World, cam_from_world: Array, width: int) -> tuple[Array, Array
 def center(cam_from_world: Array) -> Array:
     """Return the camera centre [3] of a pose [4, 4]."""
     return -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-
-
-def workers() -> int:
-    """Return the number of rendering threads: one per available processor, at most 8."""
-    return min(8, cores())
 
 
 def _jitter(height: int, samples: int, seed: int) -> Array:

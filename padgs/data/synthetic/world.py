@@ -16,6 +16,7 @@ import numpy as np
 from padgs.data.synthetic.shapes import Flat, Point, Shape
 from padgs.data.synthetic.textures import Array, Color, bilinear
 
+SKY = -1  # object id of a ray that hits nothing
 _OCCLUSION_RADIUS = 0.9  # metres
 _LAMP_SAMPLES, _OPEN_SAMPLES = 8, 12
 _TILE = 16  # texels; rays of a tile share a list of candidate shapes
@@ -141,9 +142,6 @@ def _smooth(table: Array) -> Array:
         padded = np.pad(table, ((1, 1), (0, 0)), mode="edge")
         table = ((padded[:-2] + padded[2:]) / 4 + table / 2).T
     return np.ascontiguousarray(table, np.float32)
-
-
-SKY = -1  # object id of a ray that hits nothing
 
 
 @dataclass

@@ -79,7 +79,7 @@ def test_more_samples_converge(room):
 
 def test_rendering_does_not_depend_on_threads(room, monkeypatch):
     several = camera.draw(room.world, room.poses[0], 128, 4)
-    monkeypatch.setattr(camera, "workers", lambda: 1)
+    monkeypatch.setattr(camera, "cores", lambda: 1)
     np.testing.assert_array_equal(camera.draw(room.world, room.poses[0], 128, 4), several)
 
 
