@@ -169,6 +169,8 @@ def _worlds(scene: Scene, means: Tensor, nerfstudio: Similarity | None) -> Itera
     turns = torch.from_numpy(Rotation.create_group("O").as_matrix().round())  # axes to axes, the identity first
     for turn in turns[1:]:
         yield "with other axes", Similarity(rotation=turn)
+    if means.eq(means[0]).all():  # one place has no scale
+        return
     starts = [_closest_points(scene.points, means, Similarity(0.0, turn), *COARSE) for turn in turns]
     for _, start in sorted(starts, key=lambda found: found[0])[:FINALISTS]:
         aligned = _closest_points(scene.points, means, start, *FINE)[1]

@@ -16,6 +16,7 @@ def split(
     split: Split = "auto",
 ) -> None:
     """Divide a data set into blocks of cameras that see the same points; their images are links to those of SOURCE."""
+    import os
     import shlex
     from pathlib import Path
 
@@ -23,7 +24,7 @@ def split(
     from padgs.data.capture import DataOptions
 
     check_range(2, 10_000, blocks=blocks)
-    destination = Path(to or f"{source.rstrip('/')}-blocks")
+    destination = Path(to or f"{os.path.abspath(source)}-blocks")  # also of "."
     with name_place(destination):
         lines = write(Path(source), destination, blocks, format, DataOptions(mask=mask, split=split))
     for line in lines:

@@ -168,6 +168,14 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
     assert "did not end well" in error(str(copy), runs[1])
 
 
+def test_blocks_are_beside_the_working_folder_too(tmp_path, monkeypatch):
+    (tmp_path / "capture").mkdir()
+    monkeypatch.chdir(tmp_path / "capture")
+    monkeypatch.setattr(blocks, "split", lambda source, destination, *_: [f"{destination}: "])
+    done = CliRunner().invoke(app, ["split", ".", "--blocks", "2"])
+    assert str(tmp_path / "capture-blocks") in done.output.replace("\n", "")
+
+
 def test_what_cannot_be_split_is_refused_and_nothing_is_written(source, parts, tmp_path):
     for arguments, message in (
         (["--blocks", "9"], "--blocks is 9; 16 training views make 2 to 8 blocks"),

@@ -20,13 +20,14 @@ from padgs.apps import external
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
-from padgs.apps.frame_check import _closest_points, as_numbers, read_transform
+from padgs.apps.frame_check import _closest_points, _worlds, as_numbers, read_transform
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry.similarity import Similarity
 from padgs.methods.splats.splats import Splats
+from padgs.scene import Scene
 
 TURN = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
 MOVED = Similarity(1.7, TURN, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64))
@@ -170,6 +171,11 @@ def test_transforms_are_read_and_combined(tmp_path):
 def test_other_transforms_are_refused(text, rule):
     with pytest.raises(ValueError, match=rule):
         read_transform(text)
+
+
+def test_gaussians_in_one_place_are_not_aligned_to_points():
+    scene = Scene("", (), (), torch.randn(50, 3), torch.zeros(50, 3), "")
+    assert {words for words, _ in _worlds(scene, torch.ones(3, 3), None)} == {"with other axes"}
 
 
 def test_an_empty_file_is_no_transform(tmp_path):
