@@ -65,6 +65,8 @@ def render(
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),
             )
+    for note in getattr(found, "notes", ()):
+        show(f"  {note}")
     for written in outputs:
         show(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")
     if depth:

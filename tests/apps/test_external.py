@@ -209,6 +209,8 @@ def test_gaussians_are_shown_without_a_data_set(splats, tmp_path, generator):
     opened = open_model(str(tmp_path / "a.ply"), device="cpu")
     assert isinstance(opened, ExternalRun) and len(opened.method.model.splats) == len(broken) - 1
     assert opened.notes == ("1 Gaussians have values that are not finite, and are left out",)
+    shown = padgs_command("render", tmp_path / "a.ply", *arguments[2:], "--to", tmp_path / "g")[1]
+    assert opened.notes[0] in shown
 
 
 def test_wrong_input_is_refused(run, splats, tmp_path):

@@ -89,9 +89,9 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
             _convert(path, plain)
             return read_splats(plain, unit=unit)
     vertex, names = read_vertices(path)
-    rest = 0
-    while f"f_rest_{rest}" in names:
-        rest += 1
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if "packed_position" in names:
+        raise DataError(f"{path} is a compressed PLY; name it {path.stem}.compressed.ply")
     if missing := [name for name in _NEEDED if name not in names]:
         raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
@@ -99,7 +99,8 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
         raise DataError(f"{path} has {rest} properties f_rest_*; degrees 0 to 3 have 0, 9, 24 or 45: export one")
 
     def columns(*wanted: str) -> torch.Tensor:  # [N, len(wanted)]
-        return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))
+        with np.errstate(over="ignore"):  # infinite numbers are counted and left out by others
+            return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))
 
     empty = torch.zeros(0, 3)
     splats = Splats(empty, empty, empty, degree=degree, scene_scale=unit)

@@ -77,6 +77,9 @@ def test_invalid_files_are_refused(tmp_path, generator):
     (tmp_path / "a.ply").write_bytes(text)
     with pytest.raises(DataError, match="no property opacity"):
         read_splats(tmp_path / "a.ply")
+    (tmp_path / "a.ply").write_bytes(text.replace(b"float nx", b"float packed_position"))
+    with pytest.raises(DataError, match=r"a compressed PLY; name it a\.compressed\.ply"):
+        read_splats(tmp_path / "a.ply")
 
 
 def test_a_missing_converter_is_reported(tmp_path, generator, monkeypatch):
