@@ -32,8 +32,10 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float, far: float =
     Differentiable by `rendering.depth` only. Pixels are weighted by solid angle, by the opacity along all three rays,
     and less where the brightness bends; for cameras other than panoramas they weigh the same and rows do not wrap.
     `near` > 0 is the lower limit of distances, in the unit of the depth. Beyond the distance `far`, the opacity counts
-    times far / r: no view resolves the surface of the sky.
+    times far / r: no view resolves the surface of the sky. Images of fewer than `MIN_SIDE` pixels a side have 0.
     """
+    if min(rendering.depth.shape) < MIN_SIDE:
+        return rendering.depth.new_zeros(())
     depth, wraps = rendering.depth, isinstance(camera, Panorama)
     if far < math.inf:
         resolved = (far / depth.detach().clamp(min=near)).clamp(max=1)

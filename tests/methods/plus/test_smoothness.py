@@ -63,6 +63,11 @@ def test_roughness_is_invariant_to_units_and_heading():
     assert rough(depth * 1e4) == pytest.approx(rough(depth)) and rough(depth.roll(13, 1)) == pytest.approx(rough(depth))
 
 
+@pytest.mark.parametrize("height", [1, 2])
+def test_images_too_small_for_second_differences_are_smooth(height):
+    assert rough(1 + torch.rand(height, 2 * height)) == 0
+
+
 def test_edges_in_the_image_lower_the_weight():
     depth = torch.ones(16, 32, dtype=torch.float64)
     depth[:, 16:] = 1.05
