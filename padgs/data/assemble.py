@@ -21,6 +21,7 @@ from padgs.scene import Scene, View
 
 MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
+HIDDEN = (".", "__MACOSX", "@eaDir", "@Recycle", "#recycle")  # beginnings of names; network drives keep previews there
 PREPARED = "prepare.json"  # written by `padgs.data.prepare`
 # Files that identify a prepared data set, and a run (see `padgs.results`). Searches for images skip such folders: they
 # hold renders, or copies of images.
@@ -150,8 +151,8 @@ def file_names(folder: Path) -> list[str]:
             folders.clear()
             continue
         seen.add(here.resolve())
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        found += [(here / name).relative_to(folder).as_posix() for name in files if not name.startswith(".")]
+        folders[:] = sorted(name for name in folders if not name.startswith(HIDDEN))
+        found += [(here / name).relative_to(folder).as_posix() for name in files if not name.startswith(HIDDEN)]
     return sorted(found)
 
 

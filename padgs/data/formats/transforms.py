@@ -5,6 +5,7 @@ Poses are world from camera, with OpenGL axes: x right, y up, z backward.
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from posixpath import commonpath
 
 from padgs.data.capture import Capture, DataError, DataOptions, Frame
 from padgs.data.cloud import first_ply, read_ply
@@ -87,6 +88,6 @@ def _name(path: Json) -> str:
 
 
 def _shared_folder(names: list[str]) -> str:
-    """Return the folder that holds all images, "" if there is none: "images" for images/a.jpg, images/b.jpg."""
-    first, *others = {str(PurePosixPath(name).parent) for name in names} or {"."}
-    return "" if others or first == "." or not is_inside(first) else first
+    """Return the folder that holds all images, "" if there is none: "images" for images/a.jpg, images/hall/b.jpg."""
+    folders = [str(PurePosixPath(name).parent) for name in names]
+    return commonpath(folders) if folders and all(map(is_inside, names)) else ""

@@ -110,12 +110,15 @@ def test_nested_images(world: World, tmp_path: Path) -> None:
         (tmp_path / "a" / "images" / f"{name}.png").rename(tmp_path / "a" / "images" / folder / f"{name}.png")
         text = text.replace(f"images/{name}.png", f"images/{folder}/{name}.png")
     (tmp_path / "a" / "transforms.json").write_text(text)
+    (tmp_path / "a" / "masks" / "zwei ü").mkdir(parents=True)
+    Image.new("L", (64, 32), 100).save(tmp_path / "a" / "masks" / "zwei ü" / "pano_01.png")
     convert(tmp_path / "a", tmp_path / "b", "colmap")
     convert(tmp_path / "b", tmp_path / "c", "released")
-    scene = load(tmp_path / "c")
-    assert {"eins/pano_00", "zwei ü/pano_01"} <= {
-        view.name.removeprefix("images/") for view in (*scene.train, *scene.test)
-    }
+    convert(tmp_path / "c", tmp_path / "d", "transforms")
+    scene = load(tmp_path / "d")
+    views = {view.name: view.mask() for view in (*scene.train, *scene.test)}
+    assert {"eins/pano_00", "zwei ü/pano_01"} <= views.keys()
+    assert [name for name, mask in views.items() if mask is not None] == ["zwei ü/pano_01"]
 
 
 def test_a_full_disk_leaves_no_files(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,7 @@ def test_masks_overlays_and_renders_are_not_panoramas(tmp_path):
 
 
 def test_links_and_names_in_any_case_are_followed(tmp_path):
-    for name in ("there/b.png", "there/a.png", "Mask.PNG"):
+    for name in ("there/b.png", "there/a.png", "there/@eaDir/a.png/THUMB.png", "Mask.PNG"):
         save(tmp_path / name, 255)
     (tmp_path / "flat").mkdir()
     (tmp_path / "flat" / "room").symlink_to(tmp_path / "there")
