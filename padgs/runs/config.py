@@ -42,6 +42,7 @@ class DataConfig(DataSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_known(self, format=("auto", *LOADERS))
+        check(self, "null, or not empty (is a variable of the shell unset?)", lambda path: path != "", "path")
         if self.dataset is not None:
             check_known(self, dataset=DATASETS)
         _ = self.synthetic
@@ -107,6 +108,7 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         check_known(self, device=DEVICES)
+        check(self, "not empty (is a variable of the shell unset?)", bool, "folder")
         counts = ("jobs", "threads", "log_every", "probe_every", "checkpoint_every")
         check(self, "at least 1", lambda count: count is None or count >= 1, *counts)
         check(self, ">= 0", lambda seconds: seconds >= 0, "checkpoint_seconds")

@@ -51,6 +51,8 @@ TOO_LATE = {
     "method=padgs method.feature_rate=-1": "feature_rate is -1.0",
     "data.format=x": "unknown format 'x'; known: auto, colmap",
     "data.dataset=x": "unknown dataset 'x'; known: roam360",
+    "data.path=": "path is ; it must be null, or not empty",
+    "run.folder=": "folder is ; it must be not empty",
 }
 OF_ANOTHER_TYPE = {
     "protocol.paper=null": "protocol.paper is None; it must be a group of keys",
