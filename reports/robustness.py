@@ -21,7 +21,7 @@ from padgs.reports.charts.drawing import Chart, figure, lay_out, styled
 from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import CONFIG, by_conditions, grouped
 from padgs.reports.selection import RunSet, one_setting, refuse_differences
-from padgs.reports.significance import mean_cell
+from padgs.reports.significance import failures, mean_cell
 from padgs.reports.table import Block, Cell, Column, Row, Table
 from padgs.results import file_name
 
@@ -98,7 +98,7 @@ class StressedMethod:
         for stress, runs in self.runs.items():
             without = runs["seed"].map(above).fillna(above.mean())  # without a reference the mean of the other seeds
             shares = ((runs[QUALITY] - runs[ONE_COLOR]) / without).clip(0, 1).where(runs["ok"], 0.0)
-            found[stress] = mean_cell(shares.tolist(), _failures(runs))
+            found[stress] = mean_cell(shares.tolist(), failures(runs))
         return found
 
     def levels(self, condition: str) -> dict[int, Cell]:
@@ -296,15 +296,11 @@ def _lost(stress: Stress, metric: str, allowed: float | None, one: StressedMetho
     if runs is None:
         return Cell()
     if column not in runs or column not in one.reference:
-        return Cell(status=_failures(runs))
+        return Cell(status=failures(runs))
     ok, reference = runs.loc[runs["ok"]], one.reference.set_index("seed")[column]
     values = ok[column].astype(float)
     if "psnr" in metric:  # others are errors, and no loss
         values = ok["seed"].map(reference).fillna(reference.mean()).astype(float) - values
-    cell = mean_cell(values.dropna().tolist(), _failures(runs))
+    cell = mean_cell(values.dropna().tolist(), failures(runs))
     over = allowed is not None and cell.value is not None and cell.value > allowed
     return replace(cell, status=" ".join(filter(None, (cell.status, BEYOND if over else ""))))
-
-
-def _failures(runs: DataFrame) -> str:
-    return " ".join(runs.loc[~runs["ok"], "status"].unique())

@@ -26,9 +26,13 @@ def unrank(cells: Sequence[Cell]) -> list[Cell]:
 
 def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:
     """Return a cell for each measure: mean and deviation over successful runs, and the status of failed ones."""
-    failed = " ".join(runs.loc[~runs["ok"], "status"].unique())
-    numbers = numbers_of(runs, measures)
-    return [mean_cell(column[~np.isnan(column)].tolist(), failed) for column in numbers.T]
+    failed = failures(runs)
+    return [mean_cell(column[~np.isnan(column)].tolist(), failed) for column in numbers_of(runs, measures).T]
+
+
+def failures(runs: DataFrame) -> str:
+    """Return the statuses of failed runs, each once."""
+    return " ".join(runs.loc[~runs["ok"], "status"].unique())
 
 
 def over_scenes(runs: DataFrame, scenes: Sequence[Place], measures: Sequence[Measure]) -> list[Cell]:

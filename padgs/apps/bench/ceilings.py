@@ -99,9 +99,8 @@ def _best_rate(work: Callable[[], float], seconds: float) -> tuple[float, float]
     rates, crowding = [], []
     end = time.perf_counter() + seconds
     while time.perf_counter() < end or len(rates) < 5:
-        wall, used = time.perf_counter(), time.process_time()
-        done = work()
-        wall, used = time.perf_counter() - wall, time.process_time() - used
+        lap, done = clock.Lap(), work()
+        wall, used = lap.seconds()
         rates.append(done / used)
         crowding.append(torch.get_num_threads() * wall / used - 1)
     return max(rates), statistics.median(crowding)
