@@ -74,7 +74,7 @@ def run(
     words = Console(quiet=True) if brief else console
     introduce(config, scene, store.path, words)
     result = store.result()
-    if result is not None and not _is_incomplete(config, result):
+    if result is not None and not _is_incomplete(config, scene, result):
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
         say(words, f"finished before, nothing to do{advice}")
         show_result(result, store.path, words)
@@ -287,24 +287,21 @@ def judge(result: Result, scene: Scene, iterations: int) -> Result:
     return replace(result, status="degenerate", reason=reason) if reason else result
 
 
-def _is_incomplete(config: RunConfig, result: Result) -> bool:
+def _is_incomplete(config: RunConfig, scene: Scene, result: Result) -> bool:
     """Return whether a finished run is to be trained again, lacks scores, or does not name the experiments of here."""
     labels = results.joined(result.experiments, config.labels.experiments)
-    return _is_retried(config, result) or bool(_unscored(config, result)) or labels != result.experiments
+    return _is_retried(config, result) or bool(_unscored(config, scene, result)) or labels != result.experiments
 
 
 def _is_retried(config: RunConfig, result: Result) -> bool:
     return result.status in RETRIED and config.retry == "failed"
 
 
-def _unscored(config: RunConfig, result: Result) -> dict[str, Protocol]:
-    """Return the protocols under whose exact rules a run that ended well has no scores."""
-
-    def is_scored(name: str, protocol: Protocol) -> bool:
-        rules = json.dumps(asdict(protocol), sort_keys=True)
-        return name in result.scores and rules == json.dumps(result.scores[name].protocol, sort_keys=True)
-
-    return {name: rules for name, rules in config.protocols.items() if result.ok and not is_scored(name, rules)}
+def _unscored(config: RunConfig, scene: Scene, result: Result) -> dict[str, Protocol]:
+    """Return the protocols under whose exact rules a run that ended well has no scores of its test views, if any."""
+    known = {name: json.dumps(scores.protocol, sort_keys=True) for name, scores in result.scores.items()}
+    asked = config.protocols.items() if result.ok and scene.test else ()
+    return {name: rules for name, rules in asked if known.get(name) != json.dumps(asdict(rules), sort_keys=True)}
 
 
 def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Console) -> Result | None:
@@ -315,7 +312,7 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
             store.forget(result)
         return None
     complete = replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
-    if unscored := _unscored(config, result):
+    if unscored := _unscored(config, scene, result):
         say(console, "finished before; only the new protocol is missing")
         if not store.has_checkpoint:  # an untrained method would be scored
             raise RunFolderError(

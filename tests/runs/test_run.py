@@ -140,6 +140,16 @@ def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):
     assert "finished before" in said and f"{first.scores['paper'].metrics['psnr']:.2f}" in said
 
 
+def test_a_run_without_test_views_is_finished_all_the_same(config, monkeypatch):
+    """data.split=all"""
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: replace(tiny_scene(), test=()))
+    first, _ = run(config)
+    assert first.ok and first.scores == {}
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
+    again, said = run(config)
+    assert again == first and "nothing to do" in said
+
+
 def test_another_protocol_scores_the_finished_run_without_training(config, monkeypatch):
     first, _ = run(config)
     monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
