@@ -109,8 +109,8 @@ def find_result(source: Path, destination: Path, options: PrepareOptions) -> Pre
         record = json.loads((destination / PREPARED).read_text(encoding="utf-8"))
         if record["input"] != digest_of(fingerprint(source, options), options):
             return None
-        lists = (tuple(record[name]) for name in ("registered", "unregistered"))
-        return Prepared(destination, *lists, record["points"], record["observations"], notes=tuple(record["notes"]))
+        registered, unregistered, notes = (tuple(record[name]) for name in ("registered", "unregistered", "notes"))
+        return Prepared(destination, registered, unregistered, record["points"], record["observations"], notes=notes)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
