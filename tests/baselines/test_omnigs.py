@@ -95,6 +95,8 @@ def test_the_release_differs_by_its_deviations_only():
     deviations = {"densify_from": 0, "reset_opacity": 1.0, "prune_by_extent_from": 0}
     assert released.options == replace(described.options, **deviations, min_extent=0.0, max_gaussians=None)
     assert described.train == released.train and released.train.weight == "uniform"
+    on_roam360 = [composed(f"method={name}", "+scene=roam360_bar") for name in ("omnigs", "omnigs_release")]
+    assert [job.options.prune_by_extent for job in on_roam360] == [False, True]
 
 
 def test_finished_model(finished):
