@@ -50,8 +50,6 @@ class ODGSModel(SplatModel):
 
 
 class ODGSMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
-
     Options = ODGSOptions
     MODEL = ODGSModel
     RUN_RATES = "run_linear"

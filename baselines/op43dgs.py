@@ -53,8 +53,6 @@ class OP43DGSModel(SplatModel):
 
 
 class OP43DGSMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
-
     Options = OP43DGSOptions
     MODEL = OP43DGSModel
     RENDER = RenderConfig(projection="tangent")

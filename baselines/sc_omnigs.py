@@ -43,8 +43,6 @@ class SCOmniGSModel(SplatModel):
 
 
 class SCOmniGSMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
-
     Options = SCOmniGSOptions
     MODEL = SCOmniGSModel
     TRAIN = TrainOptions(weight="solid_angle", poses="learned_fast", lens="map")

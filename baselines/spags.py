@@ -24,7 +24,5 @@ class SPaGSOptions(SplatOptions):
 
 
 class SPaGSMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
-
     Options = SPaGSOptions
     RENDER = RenderConfig(projection="ray", near_cull="ellipsoid", low_pass=0.0, blending="hybrid", core_size=16)

@@ -167,5 +167,7 @@ class Refined:
         """Do nothing: without densification no statistics are needed."""
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Do nothing."""
+        """Let a smoothing filter follow the parameters, and do nothing else."""
+        if (follow := getattr(self._model, "follow", None)) is not None:
+            follow(iteration)
         return ()

@@ -20,6 +20,7 @@ from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends.cpu import Projected
 from padgs.render.backends.native import native_camera
 from padgs.scene import Scene
+from padgs.training.model import Refined
 
 WIDTH, HEIGHT = 2048, 1024
 OPTIONS = SPaGSMethod.RENDER.options(scene_scale=1.0)
@@ -85,8 +86,10 @@ def test_the_smoothing_filter_is_a_fifth_of_a_square_pixel_of_the_nearest_traini
     assert (splats.means.grad is None or not splats.means.grad.any()) and splats.log_scales.grad.abs().min() > 0
 
 
-def test_the_smoothing_filter_is_updated_once_a_round(scene):
+@pytest.mark.parametrize("refines", [False, True])
+def test_the_smoothing_filter_is_updated_once_a_round(refines, scene):
     model = model_of(scene, iterations=3000)
+    trained = Refined(model, "published", 3000) if refines else model
     optimizer, view = torch.optim.Adam(model.splats.parameters()), scene.train[0]
 
     def added() -> torch.Tensor:
@@ -94,10 +97,10 @@ def test_the_smoothing_filter_is_updated_once_a_round(scene):
 
     before = added()
     model.splats.means.data *= 3
-    model.adapt(1, optimizer)
+    trained.adapt(1, optimizer)
     torch.testing.assert_close(added(), before, atol=1e-7, rtol=1e-3)
     every = model.densifier.options.densify_every
-    model.adapt(every, optimizer)
+    trained.adapt(every, optimizer)
     after = added()
     assert not torch.allclose(after, before, rtol=0.1)
     model.keep(torch.arange(5))

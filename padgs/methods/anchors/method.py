@@ -176,8 +176,6 @@ class PaDGSMethodOptions(PaDGSOptions, GrowthOptions, LearningRates):
 
 
 class PaDGSMethod(Method):
-    """See `padgs.training.method.Method`."""
-
     Options = PaDGSMethodOptions
 
     def _refuse_impossible(self) -> None:

@@ -115,8 +115,6 @@ class PlusOptions(SplatOptions):
 
 
 class PlusMethod(SplatMethod):
-    """See `padgs.training.method.Method`."""
-
     Options = PlusOptions
     MODEL = PlusModel
     RENDER = RenderConfig(projection="ray", low_pass=PIXEL_VARIANCE)

@@ -112,8 +112,9 @@ class SplatModel:
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_enough_views)
         if self.pruning.is_due(iteration):
             events += self._prune(optimizer)
-        if self._filter is not None:
-            events += self._update_filter(self._filter, iteration, optimizer)
+        self.follow(iteration)
+        if self._filter is not None and iteration >= self.iterations:
+            events += self._prune_invisible(self._filter, optimizer)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
             self.splats.active_degree = degree
@@ -137,14 +138,14 @@ class SplatModel:
         self.pruning.done = True
         return (f"pruned the least important of {before} Gaussians, kept {kept}",)
 
-    def _update_filter(self, smooth: SmoothingFilter, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Update the filter after rows changed and at least once a round; at the end prune what is invisible."""
-        splats, every = self.splats, self.densifier.options.densify_every
-        if len(smooth.variances) == len(splats) and iteration % every and iteration < self.iterations:
-            return ()
-        smooth.update(splats.means)
-        if iteration < self.iterations:
-            return ()
+    def follow(self, iteration: int) -> None:
+        """Let the smoothing filter follow the means: after rows changed, at least once a round, and at the end."""
+        smooth, is_due = self._filter, iteration % self.densifier.options.densify_every == 0
+        if smooth is not None and (is_due or iteration >= self.iterations or len(smooth.variances) != len(self.splats)):
+            smooth.update(self.splats.means)
+
+    def _prune_invisible(self, smooth: SmoothingFilter, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        splats = self.splats
         visible, before = self._rendered_opacities() >= ALPHA_MIN, len(splats)
         keep_rows(splats.rows(), optimizer, visible)
         self.densifier.reset_statistics()
