@@ -67,8 +67,7 @@ class Cubemap3DGSMethod(SplatMethod):
     def refuse_search(self) -> None:
         """Refuse: a panorama that is held out would be cut into views, of which most are trained on."""
         raise ValueError(
-            "views are cut from all panoramas, so none can be held out for the search for the smallest model; take a "
-            "method that trains on panoramas"
+            "views are cut from all panoramas, so none can be held out for the search; take a method without cuts"
         )
 
     def _refuse_impossible(self) -> None:

@@ -24,7 +24,6 @@ WORDS = {
     "result": "refining and writing",
 }
 
-
 Metres = Annotated[
     tuple[str, str, float] | None,
     typer.Option(metavar="A B DISTANCE", help="scale the world: panoramas A and B were taken DISTANCE metres apart"),

@@ -55,8 +55,7 @@ def find_library(stem: str, requirement: str) -> ctypes.CDLL:
         if (folder / name).exists():
             return ctypes.CDLL(str(folder / name))
     raise OSError(
-        f"{name} not found in {', '.join(map(str, folders))}; install padgs where there is {requirement}, "
-        "or render with backend=torch"
+        f"{name} not found in {', '.join(map(str, folders))}; install padgs with {requirement}, or use backend=torch"
     )
 
 

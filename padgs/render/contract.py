@@ -11,8 +11,10 @@ This is blending "sorted"; "hybrid" differs in order and stop, see `padgs.render
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import UserDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -115,23 +117,18 @@ class Rendering:
     counters: Mapping[str, int] = field(default_factory=dict)  # gaussians, visible, instances, evaluated pairs, ...
 
 
-class LazyCounters(Mapping[str, int]):
+class LazyCounters(UserDict[str, Any]):
     """Counters of which some wait for a GPU; these are read together, on first access."""
 
     def __init__(self, known: dict[str, int], names: Sequence[str], read: Callable[[], Iterable[int]]) -> None:
         """Keep known counters, and the names of others, whose values `read` returns."""
-        self._known, self._names, self._read = known, names, read
+        super().__init__({**known, **dict.fromkeys(names)})
+        self._names, self._read = names, read
 
     def __getitem__(self, name: str) -> int:
-        if name in self._names and name not in self._known:
-            self._known.update(zip(self._names, self._read(), strict=True))
-        return self._known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys((*self._known, *self._names)))
-
-    def __len__(self) -> int:
-        return len({*self._known, *self._names})
+        if self.data[name] is None:
+            self.data.update(zip(self._names, self._read(), strict=True))
+        return self.data[name]
 
 
 @dataclass(frozen=True)

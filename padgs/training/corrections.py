@@ -204,8 +204,7 @@ class Corrections(nn.Module):
             is_map = options.lens == MAP
             if is_map and options.depth_weight:
                 raise ValueError(
-                    "train.lens=map resamples photographs, and not their depth maps; set train.depth_weight=0, or "
-                    "another lens"
+                    "train.lens=map resamples photographs, and not their depth maps; set train.depth_weight=0"
                 )
             self.lens = CameraMap(first.width, first.height) if is_map else DualLens(axis, scene_scale=scene.scale)
 

@@ -28,7 +28,6 @@ FAINTEST = 0.05  # mean opacity of a render
 MORE = 10  # times the initial number of Gaussians or anchors, or the pixels of all training views
 ADVICE = "train.monitor=false lets such a run continue"
 
-
 VALIDATION_SHARE, MIN_VALIDATION = 8, 3  # one of so many training views is held out, and at least so many are
 MIN_POOLED = 8  # validation views of a search for the smallest model
 FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes through

@@ -24,7 +24,6 @@ NORMALISATIONS = ("mean", "channel_sum")
 SQUARES_SHARE = 0.4  # of a run, at its end, in which squared errors count if they do
 MEASURED, MONOCULAR = DEPTH_KINDS = ("measured", "monocular")
 
-
 ROW_WEIGHTS = {
     "solid_angle": solid_angle_weight,  # M = cos(latitude) of the row's centre
     "uniform": torch.ones,  # M = 1

@@ -227,8 +227,7 @@ class Method(ABC):
                 check_camera(view.camera, self.render_config.options(scene_scale=1.0))
             except ValueError as error:
                 raise ValueError(
-                    f"{view.name} is a photograph beside panoramas: {error}; or leave out photographs with "
-                    "data.cameras=panoramas"
+                    f"{view.name} is a photograph beside panoramas: {error}; or set data.cameras=panoramas"
                 ) from error
 
     @property
