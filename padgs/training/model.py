@@ -88,27 +88,34 @@ class Model(Protocol):
 
     def groups(self) -> list[ParameterGroup]:
         """Return all learnable parameters, each in exactly one group, with their learning rates."""
+        ...
 
     def draw(self, view: View) -> TrainingRender:
         """Render a view, differentiably."""
+        ...
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Collect statistics; called after `backward` and before the optimizer step."""
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify and prune if that is due; called after the optimizer step. Return events for the record."""
+        ...
 
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""
+        ...
 
     def counts(self) -> dict[str, int]:
         """Return the present counts: anchors, gaussians, ..."""
+        ...
 
     def size(self) -> Size:
         """Return the size of the model."""
+        ...
 
     def state(self) -> State:
         """Return parameters, statistics and random state, without the optimizer; not copies."""
+        ...
 
     def load_state(self, state: State) -> None:
         """Restore the model from `state`."""
@@ -133,6 +140,7 @@ class Prunable(Model, Protocol):
 
     def parts(self, view: View) -> Parts:
         """Return the Gaussians in a view; raises ValueError if views are not drawn by a plain `render`."""
+        ...
 
     def prune(self, count: int, views: Sequence[View]) -> None:
         """Keep the `count` rows that are most important to the views."""

@@ -68,6 +68,7 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
     """Serve empty pages until the context ends, at the first free port from `port`; `LOCAL`: this machine only."""
     try:
         import viser
+        from viser import _messages
     except ImportError as error:
         raise ValueError(f"the viewer needs viser: {install_command('view')}") from error
     token, local = secrets.token_urlsafe(24), host in (LOCAL, "localhost", "::1")
@@ -78,7 +79,7 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
         server.stop()
         raise ValueError(f"access to viser {viser.__version__} cannot be restricted; pip install viser==1.1.1")
     server.gui.configure_theme(dark_mode=True, show_share_button=False)  # sharing uses an external server
-    for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
+    for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
     name = f"[{host}]" if ":" in host else "localhost" if local else host
     if host == ALL_INTERFACES:

@@ -51,15 +51,17 @@ class LearningRates(ExtentOptions):
 
     def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:
         """Return parameter groups for a run of `iterations`; `extent` in `offset_rate_unit`."""
+        first, last = self.offset_rate
         rates = {
-            "offsets": LogLinear(*(extent * rate for rate in self.offset_rate), iterations),
+            "offsets": LogLinear(extent * first, extent * last, iterations),
             "features": Constant(self.feature_rate),
             "log_scales": Constant(self.log_scale_rate),
         }
         groups = [ParameterGroup(name, (getattr(model, name),), rate) for name, rate in rates.items()]
         for head in ("opacity", "color", "covariance"):
             weights = tuple(getattr(model.decoder, head).values())
-            groups.append(ParameterGroup(head, weights, LogLinear(*getattr(self, f"{head}_rate"), iterations)))
+            first, last = getattr(self, f"{head}_rate")
+            groups.append(ParameterGroup(head, weights, LogLinear(first, last, iterations)))
         return groups
 
 
