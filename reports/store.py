@@ -53,8 +53,10 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
         lines = enumerate(results.file_content(source).splitlines(), start=1)
         loads = {f"{source}:{number}": partial(_from_line, line) for number, line in lines}
     else:
-        paths = sorted(source.glob(f"*/{results.FILE_NAME}"), key=lambda path: (len(path.parent.name), path))
-        loads = {str(path): partial(_from_folder, path) for path in paths}
+        distinct: dict[Path, Path] = {}  # without links to runs beside them
+        for path in sorted(source.glob(f"*/{results.FILE_NAME}"), key=_rank):
+            distinct.setdefault(path.resolve(), path)
+        loads = {str(path): partial(_from_folder, path) for path in distinct.values()}
     runs: dict[str, Run] = {}
     errors: list[ResultError] = []
     for where, load in loads.items():
@@ -66,6 +68,10 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
         except ResultError as error:
             errors.append(error)
     return [runs[name] for name in sorted(runs)], errors
+
+
+def _rank(file: Path) -> tuple[bool, int, Path]:
+    return file.parent.is_symlink(), len(file.parent.name), file
 
 
 def _usable(run: Run, where: str) -> Run:

@@ -124,6 +124,7 @@ def test_a_copy_of_a_run_is_left_out_by_name_and_the_table_is_made(runs, tmp_pat
     names = sorted(path.name for path in runs.iterdir())
     for copy in (f"a_backup_of_{names[0]}", f"{names[1]} (copy)"):
         shutil.copytree(runs / names["backup" not in copy], runs / copy)
+    (runs / "last").symlink_to(names[-1])
     found, broken = store.read(runs)
     assert [run.result.run for run in found] == names and [run.renders.parent.name for run in found] == names
     assert len(broken) == 2 and all("is a copy of run" in str(error) for error in broken)
