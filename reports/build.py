@@ -187,10 +187,7 @@ class _Builder:
     def _average(
         self, title: str, places: Sequence[Place], count: int, runs: DataFrame, values: Sequence[str] = ()
     ) -> list[Block]:
-        """Return a block with the mean over scenes, beside the paper's over the same; none for a single scene.
-
-        `values` are those of `Spec.blocks` that all runs share.
-        """
+        """Return a block with the mean over scenes beside the paper's, of runs with these `values`; none for one."""
         if len(places) < 2:
             return []
         runs = runs.loc[runs["place"].isin(places)]

@@ -121,10 +121,7 @@ def _column(what: str, protocol: str) -> str:
 
 
 def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]:
-    """Return preset -> reason, for the presets of a block of runs whose numbers must not be ranked.
-
-    Methods are compared after equally many images if `equal_images`; otherwise after equal time.
-    """
+    """Return preset -> reason of those not to be ranked, after equally many images (`equal_images`) or equal time."""
     found: dict[str, Reason] = {}
     seen = runs.loc[runs["ok"]].groupby("preset")["images"].mean()
     for preset, images in seen[seen < LEAST_SHARE * seen.max()].items() if equal_images else ():

@@ -250,10 +250,7 @@ def differing_keys(runs: DataFrame) -> list[str]:
 
 
 def separate(runs: DataFrame, mixture: Mixture) -> DataFrame:
-    """Return all runs, those of a mixture with their differences behind the name of the scene or preset.
-
-    Raises the mixture if their differences have the same words.
-    """
+    """Return all runs, those of a mixture with their differences in the name; raise it if these have equal words."""
     own = runs.loc[mixture.runs.index]
     words = [", ".join(of) for of in zip(*(_words(column, own[column]) for column in mixture.columns), strict=True)]
     names = [_with(name, of) for name, of in zip(own[mixture.apart_in], words, strict=True)]

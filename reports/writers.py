@@ -39,10 +39,7 @@ class Page:
 
 
 def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool = False) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of each file of a report, with `svg` also charts as SVG; none of an empty table.
-
-    Names of scenes and sweeps are made safe: no file leaves its folder.
-    """
+    """Yield safe name and content of each file of a report, none of an empty table; `svg`: charts as SVG, too."""
     if isinstance(made, str):
         yield "report.html", made.encode()
     elif isinstance(made, Page):

@@ -67,10 +67,7 @@ def multirun(arguments: Sequence[str]) -> DictConfig | None:
 
 
 def configuration(settings: Sequence[str]) -> RunConfig:
-    """Return the typed configuration of `padgs-run SETTINGS`, no multirun; call it within `composing`.
-
-    It may raise a ConfigError, or a HydraException for an unknown choice.
-    """
+    """Return the typed configuration of one run, within `composing`; raises a ConfigError or a HydraException."""
     composed = compose("config", lenient(quoted(settings)), return_hydra_config=True)
     return typed_config(composed, composed.hydra.runtime.choices)
 

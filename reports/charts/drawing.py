@@ -165,10 +165,7 @@ def spans(values: Sequence[float], ratio: float) -> bool:
 
 
 def set_axis(axis: Any, values: Sequence[float], logarithmic: bool = False, worse: int = 0) -> tuple[float, float]:
-    """Set limits, scale and ticks of a matplotlib axis for values, all positive if logarithmic; return the limits.
-
-    `worse`: see `window`.
-    """
+    """Set limits, scale and ticks of an axis for values, above 0 if logarithmic; return the limits; see `window`."""
     from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullLocator
 
     values = [value for value in values if math.isfinite(value)] or [1.0]  # inf: the PSNR of an exact render

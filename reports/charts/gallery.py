@@ -32,10 +32,7 @@ def charts(run_set: RunSet) -> list[Chart]:
 
 
 def _images(runs: DataFrame, view: str, warnings: list[str]) -> list[tuple[str, Image.Image]]:
-    """Return titles and images of a view: ground truth, then each render above its error, by falling PSNR.
-
-    There is none if no file can be read.
-    """
+    """Return titled images of a view: truth, then renders above errors, by falling PSNR; none if all are unreadable."""
     truth, renders = None, []
     for run in runs.to_dict("records"):
         try:

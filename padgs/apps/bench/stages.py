@@ -49,11 +49,7 @@ DENSIFICATIONS = 2  # measured steps of densification
 
 
 class StageClock:
-    """Wall and CPU seconds by stage.
-
-    Attributes:
-        rounds: for each finished iteration, stage -> (wall, CPU) seconds.
-    """
+    """Wall and CPU seconds by stage; `rounds` has stage -> (wall, CPU) seconds of each finished iteration."""
 
     def __init__(self) -> None:
         self.rounds: list[dict[str, tuple[float, float]]] = []
