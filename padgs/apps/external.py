@@ -242,7 +242,7 @@ class Renders:
         if missing:
             lost = f"{len(missing)} of {len(scene.test)} test views"
             renames = f", or rename the files there ({listed(sorted(of.name for of in there), 3)})" if there else ""
-            raise DataError(f"{folder} lacks {lost}: {listed(missing)}; render them all{renames}")
+            raise DataError(f"{folder} lacks {lost}: {listed(missing)}; render them all as PNG{renames}")
         for view in scene.test:
             with open_image(path := files[view.name]) as image:
                 if image.size != (view.width, view.height):
