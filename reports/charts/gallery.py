@@ -41,7 +41,7 @@ def _images(runs: DataFrame, view: str, warnings: list[str]) -> list[tuple[str, 
             warnings.append(f"a picture is left out: {error}")
             continue
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])
-        image = Image.fromarray(np.vstack([part.convert("RGB") for part in drawn]))
+        image = Image.fromarray(np.vstack([np.asarray(part.convert("RGB")) for part in drawn]))
         renders.append((math.inf, title, image) if psnr is None else (-psnr, f"{title}: {psnr:.2f} dB", image))
     renders.sort(key=lambda one: one[0])
     return [] if truth is None else [("ground truth", truth), *((title, render) for _, title, render in renders)]
