@@ -19,13 +19,13 @@ CHUNK = 1_000_000  # points in memory at a time
 CHANNELS = ("red", "green", "blue")
 
 
-def optional_module(name: str, path: Path) -> Any:
-    """Import the package that reads a file; a DataError says how to install it."""
+def optional_module(name: str, path: Path, extra: str = "scanners") -> Any:
+    """Import the package that reads a file; a DataError says by which extra it is installed."""
     try:
         return import_module(name)
     except ImportError as error:
         raise DataError(
-            f"{path} needs {name}, which cannot be imported ({error}); install it: {install_command('scanners')}"
+            f"{path} needs {name}, which cannot be imported ({error}); install it: {install_command(extra)}"
         ) from error
 
 

@@ -18,6 +18,7 @@ from padgs.data.capture import Capture, DataError, Frame, Progress, listed, sile
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks
+from padgs.data.scans import optional_module
 from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
 
@@ -60,9 +61,8 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
 
 def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[NDArray[np.uint8]]:
     """Yield the sharpest frame [H, W, 3] of every interval of time that has a frame."""
+    av = optional_module("av", video, "video")
     try:
-        import av
-
         with av.open(str(video)) as container:
             if not container.streams.video:
                 raise DataError(f"{video} holds no video stream; give a stitched 360-degree video")
@@ -88,11 +88,9 @@ def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[ND
                 interval = now
         if best is not None:
             yield best
-    except ImportError as error:
-        raise DataError(f"reading {video} needs PyAV: pip install 'padgs[video]'") from error
     except DataError:  # not panoramas
         raise
-    except (OSError, ValueError, RuntimeError) as error:
+    except (av.error.FFmpegError, OSError, ValueError, RuntimeError) as error:
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
 
 

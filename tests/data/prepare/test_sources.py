@@ -125,7 +125,7 @@ def test_videos_are_recognised_by_suffix_and_blur_lowers_sharpness(tmp_path):
 
 def test_a_missing_extra_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(DataError, match=r"needs PyAV: pip install 'padgs\[video\]'"):
+    with pytest.raises(DataError, match=r"needs av, which cannot be imported .*pip install 'padgs\[video\]'"):
         extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
 
 
@@ -198,7 +198,7 @@ def test_videos_that_are_not_upright_panoramas_of_one_eye_are_refused(name, numb
         _pixels(frame(0, transfer=16), Path("a.mp4"))
 
 
-def test_other_aspect_ratios_and_other_files_are_refused(tmp_path):
+def test_other_aspect_ratios_and_other_files_are_refused(tmp_path, monkeypatch):
     write(tmp_path / "a.mp4", 3 * [np.zeros((72, 128, 3), np.uint8)])
     calls = []
     with pytest.raises(DataError, match=r"a.mp4 is 128x72, which is not 2:1; an equirectangular panorama covers 360"):
@@ -206,6 +206,14 @@ def test_other_aspect_ratios_and_other_files_are_refused(tmp_path):
     assert calls == []  # at the first frame
     (tmp_path / "a.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match="cannot be decoded"):
+        extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
+    av = pytest.importorskip("av", reason="the extra video is not installed")
+
+    def of_another_kind(*_):
+        raise av.error.PatchWelcomeError(1, "Not yet implemented in FFmpeg")
+
+    monkeypatch.setattr(av, "open", of_another_kind)
+    with pytest.raises(DataError, match="cannot be decoded .*Not yet implemented"):
         extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
 
 
