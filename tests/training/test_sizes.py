@@ -1,3 +1,4 @@
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 
@@ -97,6 +98,16 @@ def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypa
     rest = list(resumed.fit(tiny_scene(), Budget(20)))
     assert [record.loss for record in (*first, *rest)] == [record.loss for record in records]
     assert_same_but_time(resumed.state(), method.state())
+
+
+def test_a_rehearsal_measures_views_of_their_own_size(monkeypatch):
+    monkeypatch.setattr(training_targets, "MIN_WIDTH", WIDTH // 2)
+    method, scene, halvings = PlusMethod(OPTIONS), tiny_scene(), []
+    model = method.build_model(scene, 10)
+    for train in (scene.train, scene.train[:1]):
+        trainer = method.build_trainer(model, replace(scene, train=train), Budget(10), nullcontext)
+        halvings.append(trainer._views.halvings(0.01))
+    assert halvings == [1, 0]
 
 
 def test_a_run_that_is_stopped_while_views_are_small_ends_on_large_ones_and_has_not_diverged(monkeypatch):

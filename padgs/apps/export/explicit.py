@@ -24,6 +24,7 @@ from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
 DISTILLATION_STEPS = 300
+UNSMOOTHED = "--smooth changes nothing: the method has no 3D filter, or it is in the scales already"
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"
 
 
@@ -69,7 +70,7 @@ def export_run(
     else:
         raise ValueError(f"{run.config.method} has no Gaussians to export; use padgs render or padgs view")
     if smooth:
-        notes.append("--smooth changes nothing: the method has no 3D filter, or it is in the scales already")
+        notes.append(UNSMOOTHED)
     if crop is not None:
         low, high = splats.means.new_tensor(crop).view(2, 3)
         inside = ((splats.means >= low) & (splats.means <= high)).all(-1)
@@ -144,19 +145,16 @@ def transform_splats(splats: Splats, new_from_old: Similarity) -> Splats:
         splats.quats.cpu().double().roll(-1, 1).numpy()
     )
     sh = harmonics_rotation(rotation, splats.degree) @ torch.cat((splats.sh_dc[:, None], splats.sh_rest), dim=1)
-    empty = splats.means[:0]
-    new = Splats(empty, empty, empty, degree=splats.degree, scene_scale=splats.scene_scale * new_from_old.scale)
-    new.load(
-        {
-            "means": new_from_old(splats.means.to(new_from_old.rotation)).to(splats.means),
-            "quats": torch.from_numpy(quats.as_quat()).roll(1, 1).to(splats.quats),
-            "log_scales": splats.log_scales + torch.tensor(new_from_old.scale).log(),
-            "opacity_logits": splats.opacity_logits,
-            "sh_dc": sh[:, 0],
-            "sh_rest": sh[:, 1:],
-        }
-    )
-    new.active_degree = splats.active_degree
+    moved = {
+        "means": new_from_old(splats.means.to(new_from_old.rotation)).to(splats.means),
+        "quats": torch.from_numpy(quats.as_quat()).roll(1, 1).to(splats.quats),
+        "log_scales": splats.log_scales + torch.tensor(new_from_old.scale).log(),
+        "sh_dc": sh[:, 0],
+        "sh_rest": sh[:, 1:],
+    }
+    new = deepcopy(splats)
+    new.scene_scale *= new_from_old.scale
+    new.load(splats.rows() | moved)
     return new
 
 
