@@ -97,10 +97,8 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
     """Return where the picture lies in its panorama (GPano); None if it is all; a DataError if numbers disagree."""
     xmp = _xmp(image)
     if (projection := stated(xmp, "ProjectionType") or "equirectangular").casefold() != "equirectangular":
-        raise DataError(
-            f"{path} says that its projection is {projection!r}, not equirectangular; convert it with the program that "
-            f"made it, or {_REMOVE}"
-        )
+        remedy = f"convert it with the program that made it, or {_REMOVE}"
+        raise DataError(f"{path} says that its projection is {projection!r}, not equirectangular; {remedy}")
     texts = {name: stated(xmp, name) for name in _CROP_PROPERTIES}
     if all(text is None for text in texts.values()):
         return None

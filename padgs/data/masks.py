@@ -113,10 +113,8 @@ def find_masks(
             inspected[path] = inspect(path, mask=True, panorama=frame.lens is None)
         mask_file = inspected[path]
         if (mask_file.width, mask_file.height) not in ((image.width, image.height), (width, height)):
-            raise DataError(
-                f"{path} is {mask_file.width}x{mask_file.height} but {image.path.name} is "
-                f"{image.width}x{image.height}; a mask must have the size of its image"
-            )
+            sizes_differ = f"{mask_file.width}x{mask_file.height} but {image.path.name} is {image.width}x{image.height}"
+            raise DataError(f"{path} is {sizes_differ}; a mask must have the size of its image")
         mask = Mask(StoredImage(path, width, height, store, "L"), fixed, inverted ^ path.name.startswith(INVERTED))
         if mask.file not in shown:
             rule = f" of {frame.name}; {_MEANING}"

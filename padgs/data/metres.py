@@ -153,10 +153,8 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     found = {k: place for k, frame in enumerate(frames) if (place := gps_of(frame.image)) is not None}
     instead = "; use --metres A B DISTANCE or --camera-height"
     if (different := len({place[:2] for place in found.values()})) < 3:
-        raise DataError(
-            f"--gps: {len(found)} of {len(frames)} images have a GPS position, {different} different ones, and "
-            f"at least 3 are needed{instead}"
-        )
+        have = f"{len(found)} of {len(frames)} images have a GPS position, {different} different ones"
+        raise DataError(f"--gps: {have}, and at least 3 are needed{instead}")
     origin, truth = local_metres([*found.values()])
     level = Similarity.turning(_common_up(poses, "--gps"), Z).rotation
     used = centers(poses)[[*found]]
@@ -178,11 +176,8 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     c, s = math.cos(angle), math.sin(angle)
     rotation = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64) @ level
     change = Similarity(scale, rotation, truth.mean(0) - scale * rotation @ used.mean(0))
-    where = ", ".join(f"{value:.7g}" for value in origin)
-    return change, (
-        f"by GPS of {len(found)} images, {residual:.2g} m from the fit; x is east, y north, z up from latitude, "
-        f"longitude, altitude {where}"
-    )
+    axes = f"x is east, y north, z up from latitude, longitude, altitude {', '.join(f'{one:.7g}' for one in origin)}"
+    return change, f"by GPS of {len(found)} images, {residual:.2g} m from the fit; {axes}"
 
 
 def gps_of(image: Path) -> tuple[float, float, float] | None:

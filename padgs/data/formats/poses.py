@@ -43,10 +43,8 @@ def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
     if matrix.shape[0] == 4:
         _finite(matrix, where)
         if torch.allclose(matrix[:3, 3], torch.zeros(3, dtype=torch.float64)) and matrix[3, :3].abs().max() > 1e-9:
-            raise DataError(
-                f"{where}: the pose is transposed, its last row {_numbers(matrix[3])} holds the translation; write it "
-                "with the translation in the last column"
-            )
+            found = f"the pose is transposed, its last row {_numbers(matrix[3])} holds the translation"
+            raise DataError(f"{where}: {found}; write it with the translation in the last column")
         if not torch.allclose(matrix[3], torch.tensor([0, 0, 0, 1], dtype=torch.float64), atol=1e-6):
             raise DataError(f"{where}: the last row of the pose is {_numbers(matrix[3])}; it must be 0 0 0 1")
     return cam_from_center(checked_rotation(matrix[:3, :3], where).T, matrix[:3, 3], where)
@@ -98,39 +96,30 @@ def checked_rotation(rotation: Tensor, where: str) -> Tensor:
         raise DataError(f"{where}: a rotation has the shape {list(rotation.shape)}; it must be 3x3")
     gram = rotation @ rotation.T
     identity = torch.eye(3, dtype=torch.float64)
-    determinant = torch.linalg.det(rotation).item()
-    if (gram - identity).abs().max() > TOLERANCE:
+    if (off := (gram - identity).abs().max()) > TOLERANCE:
         scale = gram.diagonal().mean().sqrt().item()
         if scale > 0 and (gram / scale**2 - identity).abs().max() <= TOLERANCE:
-            raise DataError(
-                f"{where}: the pose holds a rotation times {scale:.6g}; scale belongs to the positions: divide the "
-                "3x3 part by it"
-            )
+            remedy = "scale belongs to the positions: divide the 3x3 part by it"
+            raise DataError(f"{where}: the pose holds a rotation times {scale:.6g}; {remedy}")
         raise DataError(
             f"{where}: the 3x3 part of the pose is not a rotation: R R^T differs from the identity by "
-            f"{(gram - identity).abs().max().item():.3g} (at most {TOLERANCE:g} is accepted as rounding)"
+            f"{off.item():.3g} (at most {TOLERANCE:g} is accepted as rounding)"
         )
-    if determinant < 0:
-        raise DataError(
-            f"{where}: the pose is left-handed (determinant {determinant:.3f}); one axis is mirrored, negate the "
-            "column of the axis that points the wrong way"
-        )
+    if (determinant := torch.linalg.det(rotation).item()) < 0:
+        remedy = "one axis is mirrored, negate the column of the axis that points the wrong way"
+        raise DataError(f"{where}: the pose is left-handed (determinant {determinant:.3f}); {remedy}")
     left, _, right = torch.linalg.svd(rotation)
     return left @ right
 
 
 def _finite(values: Tensor, where: str) -> Tensor:
     values = torch.as_tensor(values, dtype=torch.float64)
+    remedy = "remove the image or compute its pose again"
     if not values.isfinite().all():
-        raise DataError(
-            f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; remove the image or compute its "
-            "pose again"
-        )
+        raise DataError(f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; {remedy}")
     if (far := values[values.abs() > FARTHEST]).numel():
-        raise DataError(
-            f"{where}: the pose contains {_numbers(far[:1])}; nothing farther than {FARTHEST:g} from the origin can be "
-            "rendered: remove the image or compute its pose again"
-        )
+        rule = f"nothing farther than {FARTHEST:g} from the origin can be rendered"
+        raise DataError(f"{where}: the pose contains {_numbers(far[:1])}; {rule}: {remedy}")
     return values
 
 

@@ -68,10 +68,8 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
     stated = frame.get("camera_model") or meta.get("camera_model")
     model = stated and stated.text()
     if model not in MODELS:
-        raise DataError(
-            f"{meta.where}: {name} has camera_model {model!r}; only EQUIRECTANGULAR panoramas can be used "
-            "(set camera_model if these are panoramas)"
-        )
+        rule = "only EQUIRECTANGULAR panoramas can be used (set camera_model if these are panoramas)"
+        raise DataError(f"{meta.where}: {name} has camera_model {model!r}; {rule}")
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]
     mask = frame.get("mask_path")
     width, height = (side and side.whole() for side in (frame.get(key) or meta.get(key) for key in ("w", "h")))

@@ -85,10 +85,9 @@ class SyntheticOptions:
                 f"{MAX_PIXELS / 1e9:g} are generated; lower data.width, data.generator.train_views or test_views"
             )
         if self.rooms is not None and (self.scene != "room_chain" or self.rooms < 1):
-            raise DataError(
-                f"rooms is {self.rooms} of scene {self.scene}; only room_chain has this option, which must be 1 or "
-                "more: set data.generator.scene=room_chain, or rooms to null"
-            )
+            rule = "only room_chain has this option, which must be 1 or more"
+            remedy = "set data.generator.scene=room_chain, or rooms to null"
+            raise DataError(f"rooms is {self.rooms} of scene {self.scene}; {rule}: {remedy}")
 
     @property
     def title(self) -> str:
