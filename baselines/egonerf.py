@@ -23,7 +23,6 @@ class EgoNeRFMethod(Method):
     TRAIN = TrainOptions(weight="uniform", learning_rates="published", adam_beta2=0.99)
 
     def refuse_budget(self, budget: Budget) -> None:
-        """Also refuse numbers of Gaussians and validation views."""
         super().refuse_budget(budget)
         if budget.gaussians is not None:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
@@ -31,7 +30,6 @@ class EgoNeRFMethod(Method):
             raise ValueError("budget.stop is auto, which needs validation views, but rays come from all; set it to end")
 
     def refuse_search(self) -> None:
-        """Refuse: there are no Gaussians."""
         raise ValueError("egonerf has no Gaussians to prune, so it has no smallest model; take a method with Gaussians")
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
@@ -48,7 +46,6 @@ class EgoNeRFMethod(Method):
         return RayTrainer(model, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:
-        """Also refuse options that do not apply to this method."""
         train = self.train_options
         loss = replace(self.TRAIN, weight=train.weight, check_every=train.check_every, monitor=train.monitor)
         if self.render_config.backend not in BACKENDS:

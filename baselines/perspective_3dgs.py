@@ -71,7 +71,6 @@ class Cubemap3DGSMethod(SplatMethod):
         )
 
     def _refuse_impossible(self) -> None:
-        """Also refuse options that need panoramas as training views."""
         if self.render_config.projection == "pinhole" and not self.render_config.cubemap:
             raise ValueError(
                 "projection pinhole cannot draw the held-out panoramas at once; set render.cubemap=true, or "

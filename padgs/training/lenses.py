@@ -161,12 +161,9 @@ class DualLens(nn.Module):
     The stitching causes parallax at the seam. Two views with their own centres and rays are blended per pixel. After
     the abstract of Seam360GS (arXiv 2508.20080); the formulas are ours (docs/methods.md).
 
-    Attributes:
-        gap: [] distance between the optical centres, scene units; positive: each lens is on its own side.
-        coefficients: [2, K] of `padgs.geometry.lens.bend`, for the lens along the axis and the other.
-        axis: [3] float64 of the first lens, camera frame.
-        blend: radians, half width of the band in which both lenses are seen.
-        scene_scale: `Scene.scale`, world units.
+    `gap` [] is the distance between the optical centres, scene units; positive: each lens is on its own side.
+    `coefficients` [2, K] of `padgs.geometry.lens.bend` are for the lens along the `axis` [3] float64, camera frame, and
+    the other; `blend`, radians, is half the width of the band in which both lenses are seen.
     """
 
     axis: Tensor

@@ -76,9 +76,8 @@ class PlainAdam(torch.optim.Adam):
 class Optimizer:
     """Adam with a learning rate per parameter group, and checks for values that are not finite.
 
-    Attributes:
-        adam: the torch optimizer, whose rows densification edits.
-        pace: of the learning rates in the last step; None before the first, and for published rates.
+    `adam` is the torch optimizer, whose rows densification edits; `pace` is that of the learning rates in the last
+    step, None before the first, and for published rates.
     """
 
     def __init__(self, groups: Sequence[ParameterGroup], check_every: int, **adam: Any) -> None:

@@ -92,21 +92,16 @@ def export_run(
     if scene.origin.any():
         origin = " ".join(f"{number:.10g}" for number in scene.origin.tolist())
         notes.append(f"the origin is at {origin} in the world of the data set, which is too far away for float32")
-    start = _central_camera(scene.train, scene.scale)
+    centres = torch.stack([view.center.double().cpu() for view in scene.train])
+    central = int((centres - centres.mean(0)).norm(dim=-1).argmin())
+    ahead = scene.train[central].cam_from_world[2, :3].double().cpu()
+    start = torch.stack((centres[central], centres[central] + scene.scale * ahead))
     if upright:
         up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).up)
         rotation = Similarity.turning(up, UP)
         splats, start = transform_splats(splats, rotation), rotation(start)
         notes[notes.index(AXES)] = "units of the scene, rotated so that -y is up"
     return Exported(splats, tuple(notes), start)
-
-
-def _central_camera(views: Sequence[View], scale: float) -> Tensor:
-    """Return centre and target [2, 3] of the view nearest to the mean centre; the target is one `scale` away."""
-    centres = torch.stack([view.center.double().cpu() for view in views])
-    number = int((centres - centres.mean(0)).norm(dim=-1).argmin())
-    forward = views[number].cam_from_world[2, :3].double().cpu()
-    return torch.stack((centres[number], centres[number] + scale * forward))
 
 
 def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:

@@ -65,10 +65,7 @@ class Page:
     def __init__(
         self, client: Any, renderers: Sequence[RunRenderer], box: Box, lock: threading.Lock, *, may_stop: bool
     ) -> None:
-        """Add the controls for one run or two to a `viser.ClientHandle`, with an initial crop `box`.
-
-        `lock` is held while rendering, because pages share the processor; `may_stop`: the page may stop training.
-        """
+        """Add the controls to a `viser.ClientHandle`; pages share the processor by a `lock`; `may_stop` training."""
         self._client, self._renderers, self._lock = client, tuple(renderers), lock
         self._changed, self._closed = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._render_loop, daemon=True, name="padgs page")

@@ -92,12 +92,10 @@ class NewAnchors:
 
 
 class Growth:
-    """Densification of one model.
+    """Densification of one model; random choices are of its `generator`, on the CPU.
 
-    Attributes:
-        statistics: sums since each entry was last used, one row per anchor (A anchors of K Gaussians): opacity [A],
-            positive raw opacities; decoded [A], iterations; gradient [A, K], norms; seen [A, K], iterations.
-        generator: random choices, on the CPU.
+    `statistics` are sums since each entry was last used, one row per anchor (A anchors of K Gaussians): opacity [A],
+    positive raw opacities; decoded [A], iterations; gradient [A, K], norms; seen [A, K], iterations.
     """
 
     def __init__(self, model: PaDGS, options: GrowthOptions, *, seed: int = 0) -> None:

@@ -139,12 +139,9 @@ class RayColors(NamedTuple):
 class EgoNeRF(nn.Module):
     """The radiance field. Internal positions are (world - centre) / unit.
 
-    Attributes:
-        centre: [3] float64, mean camera position in the world.
-        unit: world units per unit of the model.
-        travel: largest distance of a camera from the centre, model units; grids reach `far` beyond it.
-        kind: surroundings, indoor or outdoor.
-        constants: of the surroundings, or given.
+    `centre` [3] float64 is the mean camera position in the world, `unit` are world units per unit of the model,
+    `travel` is the largest distance of a camera from the centre, model units; grids reach `far` beyond it. `kind` are
+    the surroundings, indoor or outdoor, with their `constants`, or given ones.
     """
 
     centre: Tensor

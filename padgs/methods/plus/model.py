@@ -81,7 +81,6 @@ class PlusModel(SplatModel):
         return kept * (1 / opacities).clamp(max=1 / (1 - share))
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Densify, prune by importance, and activate the next SH degree, each when it is due."""
         self._step = iteration
         return super().adapt(iteration, optimizer)
 
@@ -100,7 +99,6 @@ class PlusModel(SplatModel):
         return smoothed_for_view(gaussians, view, self._finest[1], self._config.low_pass)
 
     def state(self) -> State:
-        """Return the state of the splats, the schedule step and the training cameras."""
         state = super().state()
         return State(state.tensors | {CAMERAS: self._cameras}, state.values | {"step": self._step})
 

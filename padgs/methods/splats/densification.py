@@ -83,12 +83,10 @@ class DensificationOptions:
 
 
 class Densifier:
-    """Densification of one model.
+    """Densification of one model; random positions are of its `generator`, on the CPU.
 
-    Attributes:
-        statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, and for
-            space_absolute absolute [N] gradients.
-        generator: random positions of new Gaussians, on the CPU.
+    `statistics` are sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, and for
+    space_absolute absolute [N] gradients.
     """
 
     def __init__(
