@@ -72,14 +72,9 @@ def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
 class PoseRefinement(nn.Module):
     """Corrections of the poses of named views.
 
-    Each view has its own parameters, so that Adam leaves a view's moments alone while other views are rendered.
-
-    Attributes:
-        names: names of the V views.
-        given: [V, 4, 4] float64 cam_from_world before the correction.
-        quaternions: V times [4] (w, x, y, z), not normalised.
-        shifts: V times [3], camera frame, scene scales.
-        scale: [] scene scale in world units.
+    Each view has its own parameters, so that Adam leaves a view's moments alone while other views are rendered:
+    `quaternions`, V times [4] (w, x, y, z), not normalised, and `shifts`, V times [3], camera frame, scene scales.
+    `given` [V, 4, 4] float64 are cam_from_world of the V `names` before, `scale` [] is the scene scale in world units.
     """
 
     given: Tensor
@@ -182,10 +177,8 @@ OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
 class Corrections(nn.Module):
     """Corrections of the training views of a scene; no parameters if nothing is corrected.
 
-    Attributes:
-        poses, lens: corrections of the poses, and the camera of all views; None if not learned.
-        log_gains, offsets: V times [3] for each colour channel, a parameter per view as for poses; empty if exposures
-            are not learned.
+    `poses` and `lens`, the camera of all views, are None if they are not learned; `log_gains` and `offsets` are V times
+    [3] for each colour channel, a parameter per view as for poses, and empty if exposures are not learned.
     """
 
     def __init__(self, scene: Scene, options: TrainOptions) -> None:

@@ -63,15 +63,11 @@ def photometric_loss(
 def inverse_range_loss(depth: Tensor, truth: Tensor, weight: Tensor, unit: float, kind: str = MEASURED) -> Tensor:
     """Return the weighted mean of |unit / depth - unit / truth| over pixels with a known truth, a scalar.
 
-    Inverse ranges of far surfaces, whose range is the least certain, differ least. Differentiable by `depth`.
-
-    Args:
-        depth: [H, W] of a render; pixels where nothing is drawn, 0, are left out.
-        truth: [H, W]; 0, NaN or negative: unknown, inf: sky.
-        weight: [H, W] or [H, 1].
-        unit: length that makes inverse ranges plain numbers, such as the scene scale.
-        kind: monocular: a scale and a shift of the inverse truth are fitted to the render by least squares; the loss is
-            0 if that turns near and far around.
+    Inverse ranges of far surfaces, whose range is the least certain, differ least. Differentiable by `depth` [H, W] of
+    a render, where pixels in which nothing is drawn, 0, are left out. `truth` [H, W]: 0, NaN or negative is unknown,
+    inf the sky; `weight` is [H, W] or [H, 1], `unit` a length that makes inverse ranges plain numbers, such as the
+    scene scale. With `kind` monocular, a scale and a shift of the inverse truth are fitted to the render by least
+    squares; the loss is 0 if that turns near and far around.
     """
     known = (truth > 0) & (depth > 0)
     weight = (weight * known) / (weight * known).sum().clamp(min=1e-12)
