@@ -61,7 +61,6 @@ class Claim:
     others: Any
     required: tuple[str, ...] = ()
     scenes: str = ""
-    within: tuple[str, ...] = ()
     published: Sequence[tuple[int, str, str]] = ()
     published_metric: str = ""
     note: str = ""
@@ -191,7 +190,7 @@ def findings(run_set: RunSet) -> Page:
 
 
 def measured(claim: Claim, run_set: RunSet) -> DataFrame:
-    """Return a row for each scene (and value of `within`): the advantage of the means over seeds over the best rival's.
+    """Return a row for each scene: the advantage of the means over seeds over the best rival's.
 
     Of the sizes and lengths that both sides have, those with `LEAST_SEEDS` of both count first, then the widest, then
     the longest. Scenes that were never seen decide claims of our own alone, where there are any: nothing of the paper's
@@ -201,9 +200,8 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
     if claim.scenes:
         runs = runs.loc[[place.outdoor is (claim.scenes == "outdoor") for place in runs["place"]]]
     ours, others = claim.sides
-    shared = ("place", *claim.within, "resolution", "length", "data")
-    shared += ("machine",) if claim.metric in COSTS else ()
-    best: dict[Any, dict[str, Any]] = {}
+    shared = ("place", "resolution", "length", "data", *(("machine",) if claim.metric in COSTS else ()))
+    best: dict[Place, dict[str, Any]] = {}
     for values, alike in grouped(runs, *shared) if len(runs) else ():
         found = dict(zip(shared, values, strict=True))
         size, length = found["resolution"], found["length"]
@@ -214,14 +212,9 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             row |= {"scene": found["place"].label, "seen": found["place"].seen, "size": size, "length": length}
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)
-            key = tuple(found[name] for name in ("place", *claim.within))
             rank = itemgetter("tested", "width", "iterations")
-            best[key] = max(row, best[key], key=rank) if key in best else row
-    rows = DataFrame([best[key] for key in sorted(best, key=lambda key: key[0].rank)])
-    if claim.within and len(rows):
-        by_scene = rows.groupby("scene", sort=False)
-        means = {"advantage": by_scene["advantage"].mean(), "tested": by_scene["tested"].all()}
-        rows = by_scene.first().assign(**means).reset_index()
+            best[found["place"]] = max(row, best.get(found["place"], row), key=rank)
+    rows = DataFrame([best[place] for place in sorted(best, key=lambda place: place.rank)])
     if claim.source == OURS and len(rows) and (never := rows["tested"] & (rows["seen"] == NEVER_SEEN)).any():
         rows["tested"] = never
     return rows

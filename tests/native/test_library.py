@@ -82,9 +82,7 @@ def test_missing_library_warns_only_if_it_would_be_used(missing_library: None, g
 
 
 def test_missing_library_error(missing_library: None, gaussians: Gaussians, tmp_path: Path):
-    with pytest.raises(
-        OSError, match="padgs_cpu.* not found in .*C\\+\\+ compiler.* or render with backend=torch"
-    ) as error:
+    with pytest.raises(OSError, match="padgs_cpu.* not found in .*C\\+\\+ compiler.* or use backend=torch") as error:
         render(gaussians, VIEW, backend="cpu")
     assert str(tmp_path) in str(error.value)
 

@@ -77,7 +77,8 @@ def promised(readme: Path) -> list[dict[str, str]]:
         for line in re.findall(r"^\w+: (\+.*)$", readme.read_text(), re.MULTILINE):
             config = multirun(["-m", *line.split()])
             for job in expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader):
-                found.append({"line": line, **dict(text.lstrip("+").split("=", 1) for text in job)})
+                settings = (text.lstrip("+").split("=", 1) for text in job if not text.startswith("~"))
+                found.append({"line": line, **dict(settings)})
     return found
 
 
