@@ -102,6 +102,12 @@ def test_missing_scenes_and_unknown_formats_are_refused(tmp_path: Path) -> None:
     (tmp_path / "photo.jpg").touch()
     with pytest.raises(DataError, match=r"no known format; it holds photo.jpg. Known: .*`padgs prepare IMAGES"):
         load(tmp_path)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "transforms.json").write_text("{}")
+        hint = "a has: give that;" if name == "a" else "a, .*b have: give one;"
+        with pytest.raises(DataError, match=f"no known format, but .*{hint} it holds"):
+            load(tmp_path)
     with pytest.raises(ValueError, match="unknown data.format 'colmpa'; known: colmap"):
         load(tmp_path, "colmpa")
 

@@ -27,12 +27,35 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("navvis", ("pano/pano-poses.csv",)),
     ("e57", (E57,)),
 )
+SEARCHED = 50  # names in a folder without a format, which are tried instead of it
 # Files that may be given instead of their folder.
 ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json", "*.xml", "pano-poses.csv", E57)
 
 
 def detect(path: Path) -> tuple[str, str]:
     """Detect the format of a data set; return its name and the reason. A DataError lists what identifies a format."""
+    found = _found(path)
+    if not found:
+        children = sorted(path.iterdir()) if path.is_dir() else []
+        inside = listed([child.name for child in children]) if path.is_dir() else "a file"
+        below = [str(child) for child in children[:SEARCHED] if child.is_dir() and _found(child)]
+        hint = f", but {listed(below)} {'has: give that' if len(below) == 1 else 'have: give one'}" if below else ""
+        raise DataError(
+            f"{path} has no known format{hint}; it holds {inside or 'nothing'}. Known: a COLMAP model (sparse/0), "
+            "transforms.json, sfm_data.json, reconstruction.json, cameras.xml (Metashape), pano-poses.csv (NavVis), "
+            "an .e57 file, pose_c2w.json (360Roam), output_dir/colmap (Ricoh360), transform.json (OmniBlender), "
+            "cameras/*_cam.json (OB3D), poses.txt with scene.json (TartanAir-V2), "
+            "data_views.json with data_extrinsics.json. Panoramas without poses: run `padgs prepare IMAGES OUT` first"
+        )
+    name, *others = found
+    reason = f"format: {name}, detected by {found[name]}"
+    if others:
+        reason += f" (also present, not used: {', '.join(found[other] for other in others)}; set data.format to choose)"
+    return name, reason
+
+
+def _found(path: Path) -> dict[str, str]:
+    """Return the formats that a folder or file may have, and what identifies each."""
     found: dict[str, str] = {}
     for format, files in SIGNS:
         if not files and path.is_dir() and (model := find_model(path)):
@@ -44,17 +67,4 @@ def detect(path: Path) -> tuple[str, str]:
                 found[format] = xml.name
         elif files and all(there := [next(iter(sorted(path.glob(file))), None) for file in files]):
             found.setdefault(format, " and ".join(file.relative_to(path).as_posix() for file in there if file))
-    if not found:
-        inside = listed(sorted(child.name for child in path.iterdir())) if path.is_dir() else "a file"
-        raise DataError(
-            f"{path} has no known format; it holds {inside or 'nothing'}. Known: a COLMAP model (sparse/0), "
-            "transforms.json, sfm_data.json, reconstruction.json, cameras.xml (Metashape), pano-poses.csv (NavVis), "
-            "an .e57 file, pose_c2w.json (360Roam), output_dir/colmap (Ricoh360), transform.json (OmniBlender), "
-            "cameras/*_cam.json (OB3D), poses.txt with scene.json (TartanAir-V2), "
-            "data_views.json with data_extrinsics.json. Panoramas without poses: run `padgs prepare IMAGES OUT` first"
-        )
-    name, *others = found
-    reason = f"format: {name}, detected by {found[name]}"
-    if others:
-        reason += f" (also present, not used: {', '.join(found[other] for other in others)}; set data.format to choose)"
-    return name, reason
+    return found
