@@ -211,7 +211,7 @@ def program_of(file: Path) -> tuple[str, str]:
     """Return name and version of the program that wrote a PLY file, by its comments; empty if none says so."""
     if file.suffix == ".ply":
         with file.open("rb") as opened:
-            header = opened.read(1 << 14).partition(b"end_header")[0].decode("latin1")
+            header = opened.read(1 << 14).partition(b"end_header")[0].decode("utf-8", "replace")
         for line in header.splitlines():
             if line.startswith("comment ") and (found := PROGRAM.match(line.removeprefix("comment "))):
                 return found[1], found[2]
