@@ -19,6 +19,7 @@ from padgs.checks import install_command, unknown
 SHOW = "--cfg"
 OPTIONS = ("-m", "--multirun", SHOW, "--help", "-h", "--version")
 HELP = "see padgs-run --help"
+NEEDED = ("render", "train", "protocol", "data", "budget", "method")  # without these groups, defaults of classes count
 PLUGINS = {  # choice of conf/launcher -> module of its plugin, extra of pyproject.toml
     "local": ("hydra_plugins.hydra_joblib_launcher", "launchers"),
     "slurm": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
@@ -116,6 +117,8 @@ def problem(arguments: Sequence[str]) -> str | None:
     '+sweep=tau,seeds: one sweep at a time, because each names what it sweeps'
     >>> problem(["+scene=roam360_bar", "launcher=slurm"])
     'launcher=slurm launches the jobs of a multirun; for this run: padgs-run -m +scene=roam360_bar launcher=slurm'
+    >>> problem(["~train", "train.iterations=100"])
+    '~train: every run has train settings; choose others by train=NAME, or change a key of them'
     >>> problem(["+sweep=tau", "run.jobs=4"])
     'run.jobs=4 requires a launcher that runs several jobs at a time, e.g. launcher=local'
     """
@@ -131,6 +134,8 @@ def problem(arguments: Sequence[str]) -> str | None:
         key = key.lstrip("+~")
         if not key or not (equals or argument.startswith("~")):
             return f"{argument} is no setting: these are KEY=VALUE, e.g. data.path={value or argument}; {HELP}"
+        if argument.startswith("~") and key in NEEDED:
+            return f"{argument}: every run has {key} settings; choose others by {key}=NAME, or change a key of them"
         if not equals:
             continue
         if key in settings:
