@@ -50,6 +50,8 @@ class ODGSModel(SplatModel):
 
 
 class ODGSMethod(SplatMethod):
+    """ODGS (Lee et al. 2024), with learning rates by its own law."""
+
     Options = ODGSOptions
     MODEL = ODGSModel
     RUN_RATES = "run_linear"

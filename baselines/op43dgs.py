@@ -53,6 +53,8 @@ class OP43DGSModel(SplatModel):
 
 
 class OP43DGSMethod(SplatMethod):
+    """OP43DGS (Huang et al. 2024): tangent planes, and learning rates by its own law."""
+
     Options = OP43DGSOptions
     MODEL = OP43DGSModel
     RENDER = RenderConfig(projection="tangent")

@@ -43,6 +43,8 @@ class SCOmniGSModel(SplatModel):
 
 
 class SCOmniGSMethod(SplatMethod):
+    """SC-OmniGS (Huang et al. 2025): poses and a map of the camera are learned with the Gaussians."""
+
     Options = SCOmniGSOptions
     MODEL = SCOmniGSModel
     TRAIN = TrainOptions(weight="solid_angle", poses="learned_fast", lens="map")

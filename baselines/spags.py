@@ -24,5 +24,7 @@ class SPaGSOptions(SplatOptions):
 
 
 class SPaGSMethod(SplatMethod):
+    """SPaGS (Li, Hahlbohm et al. 2025): responses along rays, hybrid transparency with a core of 16."""
+
     Options = SPaGSOptions
     RENDER = RenderConfig(projection="ray", near_cull="ellipsoid", low_pass=0.0, blending="hybrid", core_size=16)

@@ -178,6 +178,8 @@ class PaDGSMethodOptions(PaDGSOptions, GrowthOptions, LearningRates):
 
 
 class PaDGSMethod(Method):
+    """PaD-GS: anchors whose Gaussians are decoded for each view."""
+
     Options = PaDGSMethodOptions
 
     def _refuse_impossible(self) -> None:

@@ -115,6 +115,8 @@ class PlusOptions(SplatOptions):
 
 
 class PlusMethod(SplatMethod):
+    """padgs+: explicit Gaussians along rays, with its own start, densification and pruning."""
+
     Options = PlusOptions
     MODEL = PlusModel
     RENDER = RenderConfig(projection="ray", low_pass=PIXEL_VARIANCE)
