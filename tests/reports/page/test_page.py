@@ -42,6 +42,8 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
 def test_the_mean_after_equal_time_is_the_first_chart():
     html = page.html(run_set(at_equal_time("synthetic-room", "synthetic-outdoor")))
     assert "mean over synthetic-outdoor, synthetic-room" in html.partition('<figure class="chart"')[2][:2000]
+    charts, first, second = (html.index(f'<section id="{name}"') for name in ("charts", "equal_time", "runs"))
+    assert charts < first < second and 'download="equal_time.csv"' in html and '<select id="set"' in html
 
 
 def test_scenes_can_be_chosen_by_set_and_by_name():
