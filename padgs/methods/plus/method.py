@@ -3,6 +3,9 @@
 Explicit Gaussians, rendered exactly along each ray, are densified in eight rounds and pruned by importance in a ninth.
 No constant is in world units, numbers follow the pixels of the images, and latitude is no special case. Each part is an
 option that can be switched off (`+experiment=plus_ablation`).
+
+The number of Gaussians: `SplatMethod.build_model` sets the initial number and the limit,
+`padgs.methods.splats.densification` adds Gaussians above a threshold, `padgs.methods.splats.importance` prunes them.
 """
 
 from __future__ import annotations
