@@ -1,4 +1,7 @@
-"""Files of COLMAP models, text and binary. Source: the description of COLMAP's output format, 3.x and 4.x."""
+"""Files of COLMAP models, text and binary. Source: the description of COLMAP's output format, 3.x and 4.x.
+
+A damaged file is a DataError: it names the line of a text, or says that a binary file is truncated or too long.
+"""
 
 import struct
 from collections.abc import Callable, Iterator
