@@ -5,7 +5,7 @@ Backends are the entries of `BACKENDS`; each is a `padgs.render.contract.Backend
 
 import warnings
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from padgs.gaussians import Gaussians
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
 from padgs.render.ray_blocks import is_in_blocks, rasterize_blocks, seen
+from padgs.render.supersampling import is_supersampled, rasterize_samples
 from padgs.scene import View
 
 BACKENDS = {
@@ -74,10 +75,17 @@ def render(
     """
     request = make_request(gaussians, view, options, background, mean_offsets, absgrad)
     name = resolve_backend(backend, gaussians.means)
+    if is_supersampled(request):
+        return rasterize_samples(partial(_rasterize, name), request)
+    return _rasterize(name, request)
+
+
+def _rasterize(name: str, request: Request) -> Rendering:
+    """Render by the backend of that name, with one sample a pixel."""
     rasterize: Backend = lookup(BACKENDS, name, "backend")
-    if options.cubemap:
+    if request.options.cubemap:
         return rasterize_cubemap(rasterize, request)
-    if not is_in_blocks(view.camera):
+    if not is_in_blocks(request.camera):
         return rasterize(request)
     if name != "torch":
         return rasterize_blocks(rasterize, request)

@@ -29,6 +29,7 @@ TRANSMITTANCE_MIN = 1e-4
 NEAREST, FURTHEST = 1e-15, 1e15
 CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments belong to the tail
 CORE_SIZE, MAX_CORE_SIZE = 16, 256
+MAX_SUPERSAMPLING = 8
 BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
 NEAR_CULLS = ("mean", "ellipsoid")
@@ -49,6 +50,8 @@ class RenderOptions:
     near_cull: str = "mean"  # what must be farther than near: the mean, or ellipsoid (ray): the whole drawn Gaussian
     # variance of the low-pass filter in square pixels (cubemap: of its panorama; perspective image: at its centre)
     low_pass: float = 0.3
+    # n x n samples a pixel, which is their mean; `low_pass` is then in square samples. The rays of a table have one.
+    supersampling: int = 1
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none
     cubemap: bool = False  # render a panorama from the six faces of a cube, each a perspective view
@@ -61,6 +64,7 @@ class RenderOptions:
         check_known(self, bounds=BOUNDS, near_cull=NEAR_CULLS, blending=BLENDINGS)
         check(self, "a distance >= 0 in world units", lambda near: 0 <= near < math.inf, "near")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "low_pass")
+        check(self, f"from 1 to {MAX_SUPERSAMPLING}", lambda n: 1 <= n <= MAX_SUPERSAMPLING, "supersampling")
         check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", lambda n: 1 <= n <= MAX_CORE_SIZE, "core_size")
         check(self, "at least 1", lambda most: most >= 1, "max_instances")
         if self.near_cull == "ellipsoid" and self.projection != "ray":

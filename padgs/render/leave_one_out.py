@@ -42,7 +42,8 @@ def leave_one_out(
 ) -> Removals:
     """Score N Gaussians by one view with a black background.
 
-    Hybrid blending is scored as if it were sorted, and a cubemap as a panorama by rays; these scores are estimates.
+    Hybrid blending is scored as if it were sorted, a cubemap as a panorama by rays, and several samples a pixel as one;
+    these scores are estimates.
 
     `target` [H, W, 3] is the ground truth; only ratios of the pixels' weights [H, W] or [H, 1] >= 0 matter. With
     backend auto, tensors of a GPU are scored on the CPU if the library for it is missing. Raises ValueError as
@@ -52,6 +53,7 @@ def leave_one_out(
     if backend == "auto" and resolved == "torch" and device.type != "cpu":
         found = leave_one_out(gaussians.to("cpu"), view, target.cpu(), weight.cpu(), options)
         return Removals(*(tensor.to(device) for tensor in vars(found).values()))
+    options = replace(options, supersampling=1)
     if options.blending == "hybrid":
         options = replace(options, blending="sorted", core_size=CORE_SIZE)
     if options.cubemap:

@@ -39,7 +39,6 @@ class PlusModel(SplatModel):
         super().__init__(splats, options.for_views(largest, count), config, **kwargs)
         self.options = options
         self._smoothness = options.smoothness(count)
-        self._step = 0  # last step of the schedule
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
         self._finest: tuple[Tensor, Tensor] | None = None  # means, and the finest training pixel at each
@@ -80,10 +79,6 @@ class PlusModel(SplatModel):
         kept = _hashed(seed, len(opacities), opacities.device) >= share * 2**32
         return kept * (1 / opacities).clamp(max=1 / (1 - share))
 
-    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        self._step = iteration
-        return super().adapt(iteration, optimizer)
-
     @property
     def has_smoothing_filter(self) -> bool:
         """True if the training cameras are known and the low-pass acts in space, where it can be widened."""
@@ -100,16 +95,11 @@ class PlusModel(SplatModel):
 
     def state(self) -> State:
         state = super().state()
-        return State(state.tensors | {CAMERAS: self._cameras}, state.values | {"step": self._step})
-
-    def load_model(self, state: State) -> None:
-        """Load the parameters only, as those of a finished schedule: without dropout until `adapt` says otherwise."""
-        super().load_model(state)
-        self._step = self.iterations
+        return State(state.tensors | {CAMERAS: self._cameras}, state.values)
 
     def load_state(self, state: State) -> None:
         super().load_state(state)
-        self._step, self._cameras, self._finest = state.values["step"], state.tensors[CAMERAS], None
+        self._cameras, self._finest = state.tensors[CAMERAS], None
 
 
 def _hashed(seed: int, count: int, device: torch.device) -> Tensor:

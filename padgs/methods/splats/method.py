@@ -42,6 +42,7 @@ class SplatOptions(DensificationOptions, ExtentOptions):
     limit_per_pixel: float | None = None  # maximal Gaussians per independent pixel, which bounds memory and time
     means_rate_factor: float = 1.0  # factor on the learning rate of the means in 3DGS
     prune_psnr: float | None = None  # dB of the pruning step, see `count_for_psnr`; None: by `budget.gaussians` only
+    supersampling_from: float = 0.0  # share of the run with one sample a pixel, before `render.supersampling` acts
     # Variance in square pixels of the finest training view (3D smoothing filter of Mip-Splatting and SPaGS,
     # `padgs.methods.splats.smoothing_filter`); 0: none.
     smoothing_filter: float = 0.0
@@ -51,6 +52,7 @@ class SplatOptions(DensificationOptions, ExtentOptions):
             part.__post_init__(self)
         check(self, f"0 to {MAX_DEGREE}", lambda degree: 0 <= degree <= MAX_DEGREE, "sh_degree")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "smoothing_filter")
+        check(self, "a share of the run in [0, 1)", lambda share: 0 <= share < 1, "supersampling_from")
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_rate_factor")
         check(self, "> 0 and finite, or none for no pruning", lambda p: p is None or 0 < p < math.inf, "prune_psnr")
@@ -75,6 +77,12 @@ class SplatMethod(Method):
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()
+        default = type(self.options)().supersampling_from
+        if self.render_config.supersampling == 1 and self.options.supersampling_from not in (0, default):
+            raise ValueError(
+                f"method.supersampling_from is {self.options.supersampling_from}, but render.supersampling is 1; set "
+                f"render.supersampling=2, or method.supersampling_from={default:g}"
+            )
         if self.options.positional_gradient == "space_absolute" and self.render_config.projection != "ray":
             raise ValueError(
                 "method.positional_gradient=space_absolute is made for render.projection=ray, not "
@@ -158,4 +166,5 @@ class SplatMethod(Method):
             prune_psnr=options.prune_psnr or (PRUNE_PSNR if self._gaussians == AUTO else None),
             smoothing_filter=options.smoothing_filter,
             means_rate_factor=options.means_rate_factor,
+            supersampling_from=options.supersampling_from,
         )

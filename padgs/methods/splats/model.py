@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -46,14 +47,18 @@ class SplatModel:
         prune_psnr: float | None = None,
         smoothing_filter: float = 0.0,
         means_rate_factor: float = 1.0,
+        supersampling_from: float = 0.0,
     ) -> None:
         """Wrap splats for a run of `iterations`, with training `views` unless they are only rendered.
 
         `options` are those of a published run; `extent` is in world units; `target` as in `Densifier`; `requested` and
-        `prune_psnr` as in `PruningStep`; `smoothing_filter` is the variance of `SmoothingFilter`, 0 for none.
+        `prune_psnr` as in `PruningStep`; `smoothing_filter` is the variance of `SmoothingFilter`, 0 for none; training
+        renders have one sample a pixel before the share `supersampling_from` of the run.
         """
         self.splats, self.options, self.iterations = splats, options, iterations
         self._config, self._views, self._extent, self._means_rate_factor = config, views, extent, means_rate_factor
+        self._supersampling_from = supersampling_from
+        self._step = 0  # last step of the schedule
         self.densifier = Densifier(
             splats,
             options.for_run(iterations),
@@ -88,16 +93,18 @@ class SplatModel:
         if offsets is None:
             offsets = splats.means.new_zeros(len(splats), OFFSET_COLUMNS[kind], requires_grad=True)
         gaussians, absolute = splats.displaced(view, None if kind == "image" else offsets)
-        gaussians = self._training_gaussians(gaussians)
+        gaussians, options = self._training_gaussians(gaussians), self.render_options(view)
+        if self._step < self._supersampling_from * self.iterations:
+            options = replace(options, supersampling=1)
         if kind == "image":
-            rendering = self._rendered(gaussians, view, mean_offsets=offsets)
+            rendering = self._rendered(gaussians, view, options, mean_offsets=offsets)
         else:
-            rendering = self._rendered(gaussians, view, absgrad=absolute)
+            rendering = self._rendered(gaussians, view, options, absgrad=absolute)
         slots = torch.arange(len(offsets), device=offsets.device)
         return TrainingRender(rendering, offsets, gaussians, slots)
 
-    def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
-        return render(gaussians, view, self.render_options(view), backend=self._config.backend, **offsets)
+    def _rendered(self, gaussians: Gaussians, view: View, options: RenderOptions, **offsets: Any) -> Rendering:
+        return render(gaussians, view, options, backend=self._config.backend, **offsets)
 
     def _training_gaussians(self, gaussians: Gaussians) -> Gaussians:
         """Return the Gaussians as the next training render has them."""
@@ -109,6 +116,7 @@ class SplatModel:
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, prune by importance, and activate the next SH degree, each when it is due."""
+        self._step = iteration
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_enough_views)
         if self.pruning.is_due(iteration):
             events += self._prune(optimizer)
@@ -175,7 +183,7 @@ class SplatModel:
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
-        return self._rendered(self._final_gaussians(view), view)
+        return self._rendered(self._final_gaussians(view), view, self.render_options(view))
 
     def _final_gaussians(self, view: View) -> Gaussians:
         """Return the Gaussians as a finished model renders them."""
@@ -203,6 +211,7 @@ class SplatModel:
             "extent": self._extent,
             "iterations": self.iterations,
             "pruned": self.pruning.done,
+            "step": self._step,
         }
         return State(tensors, values)
 
@@ -211,15 +220,16 @@ class SplatModel:
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
-        self.pruning.done = state.values["pruned"]
+        self.pruning.done, self._step = state.values["pruned"], state.values["step"]
         if self._filter is not None:
             self._filter.variances = state.tensors[FILTER_VARIANCES].to(device, copy=True)
 
     def load_model(self, state: State) -> None:
-        """Load the parameters only; densification starts anew."""
+        """Load the parameters only, as those of a finished schedule until `adapt` says otherwise."""
         self.splats.load(state.under("splats/"))
         self.splats.active_degree = state.values["active_degree"]
         self.splats.scene_scale = state.values["scene_scale"]
+        self._step = self.iterations
         self.densifier.reset_statistics()
         if self._filter is not None:
             self._filter.update(self.splats.means)

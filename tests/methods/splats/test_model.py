@@ -131,3 +131,36 @@ def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
     extent = ExtentOptions(0.1).extent_of(scene)
     assert means.learning_rate(0) == pytest.approx(1.6e-4 * extent)
     assert method.model.densifier.extent == extent
+
+
+def test_training_renders_have_more_samples_late_in_the_run():
+    """One sample a pixel before the given share, `supersampling` from then on and in the finished model."""
+    scene = tiny_scene()
+    view = scene.train[0]
+
+    def model_with(supersampling: int, share: float) -> SplatModel:
+        splats = Splats.from_scene(scene, generator=torch.Generator())
+        config = RenderConfig(projection="ray", supersampling=supersampling)
+        options = DensificationOptions(densify_from=1000)
+        return SplatModel(splats, options, config, extent=EXTENT, iterations=10, supersampling_from=share)
+
+    model, optimizer = model_with(2, 0.6), torch.optim.Adam([torch.zeros(1, requires_grad=True)])
+    one, four = (model_with(times, 0.0).render(view).image for times in (1, 2))
+    assert (one - four).abs().max() > 1e-3
+    for step in range(10):
+        drawn = model.draw(view).rendering.image
+        torch.testing.assert_close(drawn, one if step < 6 else four)
+        torch.testing.assert_close(model.render(view).image, four)
+        resumed = model_with(2, 0.6)
+        resumed.load_state(model.state())
+        torch.testing.assert_close(resumed.draw(view).rendering.image, drawn, rtol=0, atol=0)
+        refined = model_with(2, 0.6)
+        refined.load_model(model.state())
+        torch.testing.assert_close(refined.draw(view).rendering.image, four)
+        model.adapt(step + 1, optimizer)
+
+
+def test_a_start_of_several_samples_without_them_is_refused():
+    with pytest.raises(ValueError, match=r"supersampling_from is 0\.5, but render\.supersampling is 1; set render"):
+        build_method(composed("method=spags_sorted", "method.supersampling_from=0.5"))
+    build_method(composed("method=padgs_plus", "render.supersampling=1"))  # the share of padgs_plus is its own default
