@@ -59,7 +59,7 @@ class PlusOptions(SplatOptions):
     initial_opacity: float = 0.5
     initial_scale: float = 0.6
     limit_per_pixel: float | None = 2.6
-    supersampling_from: float = 0.8
+    supersampling_from: float = 0.7
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large
