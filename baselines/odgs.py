@@ -13,7 +13,7 @@ from padgs.gaussians import Gaussians
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
-from padgs.render import Rendering
+from padgs.render import Rendering, RenderOptions
 from padgs.scene import View
 
 
@@ -41,12 +41,12 @@ class ODGSModel(SplatModel):
         super().__init__(splats, options, *args, **kwargs)
         self.densifier.extent += options.extent_margin
 
-    def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
+    def _rendered(self, gaussians: Gaussians, view: View, options: RenderOptions, **offsets: Any) -> Rendering:
         if self.options.pixel_bias:
             means, given = gaussians.means, offsets.get("mean_offsets")
             bias = 2 * self.options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
             offsets["mean_offsets"] = bias.expand(len(means), 2) if given is None else given + bias
-        return super()._rendered(gaussians, view, **offsets)
+        return super()._rendered(gaussians, view, options, **offsets)
 
 
 class ODGSMethod(SplatMethod):

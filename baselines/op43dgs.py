@@ -41,8 +41,8 @@ class OP43DGSModel(SplatModel):
             return options
         return replace(options, low_pass=options.low_pass * (view.camera.focal / RELEASED_FOCAL) ** 2)
 
-    def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
-        rendering, cap = super()._rendered(gaussians, view, **offsets), self.options.memory_cap
+    def _rendered(self, gaussians: Gaussians, view: View, options: RenderOptions, **offsets: Any) -> Rendering:
+        rendering, cap = super()._rendered(gaussians, view, options, **offsets), self.options.memory_cap
         instances = rendering.counters.get("instances", 0) if cap else 0
         if cap and (needed := instances * INSTANCE_BYTES) > cap:
             raise MemoryError(

@@ -12,17 +12,17 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 bin=${BIN:-.venv/bin} data=${DATA:-data} jobs=${JOBS:-2} out=build/campaign dry="" small=""
 
-described=omnigs,odgs,op43dgs,spags,spags_sorted,spags_tuned,padgs,padgs_unmodulated,padgs_plus
+described=omnigs,odgs,op43dgs,spags,spags_sorted,spags_tuned,spags_supersampled,padgs,padgs_unmodulated,padgs_plus
 released=omnigs_release,odgs_release,op43dgs_release,padgs_release
 six=bedroom,room,flat,basement,plaza,court
 
 # Table, scenes, runs of a scene, seconds of a run on one core (of the runs in reports/measured), settings of padgs-run
 plan() {
   cat <<END
-A $six 27 240 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 method=$described
+A $six 30 240 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 method=$described
 A $six 5 570 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0 method=$released,egonerf_small
-C $six 27 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described
-L bedroom,basement,plaza 15 330 +experiment=equal_time budget.seconds=300 budget.clock=cpu data.width=512 seed=0,1,2 method=omnigs,spags,spags_tuned,padgs,padgs_plus
+C $six 30 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described
+L bedroom,basement,plaza 18 330 +experiment=equal_time budget.seconds=300 budget.clock=cpu data.width=512 seed=0,1,2 method=omnigs,spags,spags_tuned,spags_supersampled,padgs,padgs_plus
 D bedroom,basement,court 12 350 +experiment=ablation train.iterations=3000 data.width=256 seed=0,1,2
 D bedroom,basement,court 21 350 +experiment=ladder train.iterations=3000 data.width=256 seed=0,1,2
 D bedroom,basement,court 12 270 +experiment=modulation protocol=both train.iterations=3000 data.width=256 seed=0,1,2
@@ -33,7 +33,7 @@ F bedroom,room,basement 21 200 +experiment=equal_time budget.seconds=60 budget.c
 F bedroom,room,basement 105 100 +experiment=capacity train.iterations=1500 data.width=256 seed=0,1,2
 G builtin 95 110 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=omnigs,op43dgs,spags_tuned,padgs,padgs_plus
 G builtin 40 270 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=$released stress.condition=none,world_rotation,seam,pitch,world_scale,few_points,pose_noise,few_views,exposure,noise
-J bedroom,flat,basement,court 40 50 +experiment=plus_ablation train.iterations=1000 data.width=256 seed=0,1
+J bedroom,flat,basement,court 42 50 +experiment=plus_ablation train.iterations=1000 data.width=256 seed=0,1
 END
 }
 

@@ -6,7 +6,9 @@ is filtered, is wrong where edges of opaque Gaussians cross the pixel.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 
+import torch
 from torch import Tensor
 
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
@@ -28,9 +30,9 @@ def rasterize_samples(rasterize: Callable[[Request], Rendering], request: Reques
     fine = rasterize(replace(request, camera=with_smaller_pixels(request.camera, times), options=options))
 
     def mean(samples: Tensor) -> Tensor:
-        """Average [H n, W n, C] to [H, W, C]; `sum` over slices takes a tenth of the time of `Tensor.mean`."""
-        rows = sum(samples.unflatten(0, (-1, times)).unbind(1))
-        return sum(rows.unflatten(1, (-1, times)).unbind(2)) / times**2
+        """Average [H n, W n, C] to [H, W, C]; adding slices takes a tenth of the time of `Tensor.mean`."""
+        rows = reduce(torch.add, samples.unflatten(0, (-1, times)).unbind(1))
+        return reduce(torch.add, rows.unflatten(1, (-1, times)).unbind(2)) / times**2
 
     coverage = (1 - fine.transmittance)[..., None]
     covered, distance = mean(coverage), mean(fine.depth[..., None] * coverage)

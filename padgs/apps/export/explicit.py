@@ -79,8 +79,9 @@ def export_run(
         notes.append(f"cropped to {int(inside.sum())} of {len(splats)} Gaussians")
         splats = deepcopy(splats)
         splats.load({name: rows[inside] for name, rows in splats.rows().items()})
-    kind = f"{config.low_pass:g} in {config.resolved_low_pass_kind}"
-    notes.append(f"trained with projection {config.projection} and a low-pass of {kind}; those of viewers differ")
+    kind = f"a low-pass of {config.low_pass:g} in {config.resolved_low_pass_kind}"
+    kind += f" and {config.supersampling**2} samples a pixel" if config.supersampling > 1 else ""
+    notes.append(f"trained with projection {config.projection}, {kind}; those of viewers differ")
     notes.append(AXES)
     try:
         scene = run.scene

@@ -56,11 +56,15 @@ TUNED = {
 
 
 def test_spags_tuned_has_the_options_of_padgs_plus_that_any_method_could_have():
-    tuned, narrow, plus = (composed(f"method={name}") for name in ("spags_tuned", "spags_narrow", "padgs_plus"))
+    names = ("spags_tuned", "spags_supersampled", "spags_narrow", "padgs_plus")
+    tuned, supersampled, narrow, plus = (composed(f"method={name}") for name in names)
     assert tuned.options == replace(narrow.options, **TUNED)
     assert {name: getattr(plus.options, name) for name in TUNED} == TUNED
     assert (tuned.train.weight, tuned.render.low_pass, tuned.render.blending) == ("solid_angle", 0.1, "sorted")
-    assert (tuned.train.weight, tuned.render) == (plus.train.weight, replace(plus.render, near_cull="ellipsoid"))
+    assert (tuned.train.weight, tuned.render.supersampling) == (plus.train.weight, 1)
+    assert supersampled.options == replace(tuned.options, supersampling_from=plus.options.supersampling_from)
+    assert supersampled.render == replace(plus.render, near_cull="ellipsoid")
+    assert supersampled.train == tuned.train
 
 
 @pytest.mark.parametrize("name", ["omnigs", "odgs", "op43dgs", "cubemap_3dgs", "sc_omnigs"])
