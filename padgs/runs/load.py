@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -117,9 +118,10 @@ class LoadedRun:
     def through(self, camera: Camera) -> Method:
         """Return a method that can render this camera: the run's own, or a copy with other render settings.
 
-        If the camera has finer pixels than training had, low-pass filters keep their angle, because Gaussians were
-        never seen between those pixels; methods with a smoothing filter of their own need no such change. Projections
-        of whole panoramas are replaced by `pinhole` for a perspective camera.
+        If the camera has finer pixels than training had, fewer samples a pixel are as close together, and low-pass
+        filters keep their angle, because Gaussians were never seen between those pixels; methods with a smoothing
+        filter of their own need no such change. Projections of whole panoramas are replaced by `pinhole` for a
+        perspective camera.
         """
         settings, trained = self.config.render, self.scene.train[0].camera
         if isinstance(camera, Pinhole):
@@ -136,6 +138,9 @@ class LoadedRun:
         finer = max(1.0, camera.focal / trained.focal)
         if not isinstance(camera, Panorama):
             finer /= self.method.CUT_FINENESS
+        samples = math.ceil(settings.supersampling / max(1.0, finer) - 1e-6)
+        finer *= samples / settings.supersampling
+        settings = replace(settings, supersampling=samples)
         if not self.method.has_smoothing_filter:
             settings = replace(settings, low_pass=settings.low_pass * finer**2)
         return self.method if settings == self.config.render else self.method.with_renderer(settings)

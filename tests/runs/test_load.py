@@ -68,6 +68,23 @@ def test_what_draws_panoramas_only_draws_other_cameras_by_pinhole(folder):
     assert drawn.render(replace(view, width=16, height=8, lens=lens)).image.isfinite().all()
 
 
+def test_finer_pixels_have_fewer_samples_as_close_together(tmp_path_factory):
+    overrides = "method=spags_supersampled", "render.supersampling=4"
+    run = padgs.load_run(tiny_run(tmp_path_factory, *overrides), device="cpu")
+    trained = run.method.render_config
+    view = run.scene.train[0]
+    for times, samples in ((1, 4), (1.25, 4), (2, 2), (3, 2), (4, 1), (8, 1)):
+        camera = Panorama(round(times * view.width), round(times * view.height))
+        config = run.through(camera).render_config
+        assert config.supersampling == samples
+        pitch = (times * samples / trained.supersampling) ** 2  # of samples, which have the angle of the low-pass
+        assert config.low_pass == pytest.approx(trained.low_pass * pitch)
+    finer = run.through(Panorama(4 * view.width, 4 * view.height))
+    image = finer.render(replace(view, width=4 * view.width, height=4 * view.height)).image
+    mean = image.view(view.height, 4, view.width, 4, 3).mean((1, 3))
+    torch.testing.assert_close(run.method.render(view).image, mean, atol=1e-5, rtol=0)
+
+
 def test_an_unfinished_run_is_loaded(folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "run")
     (copy / "result.json").unlink()
