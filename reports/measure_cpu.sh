@@ -12,16 +12,16 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 bin=${BIN:-.venv/bin} data=${DATA:-data} jobs=${JOBS:-2} out=build/campaign dry="" small=""
 
-described=omnigs,odgs,op43dgs,spags,spags_sorted,spags_tuned,spags_supersampled,padgs,padgs_unmodulated,padgs_plus,padgs_plus_one_sample
+described=omnigs,odgs,op43dgs,spags,spags_sorted,spags_tuned,padgs,padgs_unmodulated,padgs_plus
 released=omnigs_release,odgs_release,op43dgs_release,padgs_release
 six=bedroom,room,flat,basement,plaza,court
 
 # Table, scenes, runs of a scene, seconds of a run on one core (of the runs in reports/measured), settings of padgs-run
 plan() {
   cat <<END
-A $six 33 240 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 method=$described
+A $six 33 240 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 method=$described,spags_supersampled,padgs_plus_one_sample
 A $six 5 570 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0 method=$released,egonerf_small
-C $six 33 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described
+C $six 27 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described
 L bedroom,basement,plaza 18 330 +experiment=equal_time budget.seconds=300 budget.clock=cpu data.width=512 seed=0,1,2 method=omnigs,spags,spags_tuned,spags_supersampled,padgs,padgs_plus
 D bedroom,basement,court 12 350 +experiment=ablation train.iterations=3000 data.width=256 seed=0,1,2
 D bedroom,basement,court 21 350 +experiment=ladder train.iterations=3000 data.width=256 seed=0,1,2

@@ -36,8 +36,10 @@ class PlusModel(SplatModel):
         views = kwargs.get("views", ())
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
         count = round(sum(view.sphere_share for view in views))
-        super().__init__(splats, options.for_views(largest, count), config, **kwargs)
-        self.options = options
+        is_short = kwargs["iterations"] < options.supersampling_iterations
+        own = replace(config, supersampling=1) if is_short else config
+        super().__init__(splats, options.for_views(largest, count), own, **kwargs)
+        self.options, self._long_config = options, config
         self._smoothness = options.smoothness(count)
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
@@ -96,6 +98,12 @@ class PlusModel(SplatModel):
     def state(self) -> State:
         state = super().state()
         return State(state.tensors | {CAMERAS: self._cameras}, state.values)
+
+    def load_model(self, state: State) -> None:
+        """Load the parameters as `SplatModel` does; a model of several samples a pixel keeps them in a short run."""
+        super().load_model(state)
+        if state.values["supersampling"] > 1:
+            self._config = self._long_config
 
     def load_state(self, state: State) -> None:
         super().load_state(state)

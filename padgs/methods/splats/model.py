@@ -212,6 +212,7 @@ class SplatModel:
             "iterations": self.iterations,
             "pruned": self.pruning.done,
             "step": self._step,
+            "supersampling": self.supersampling,
         }
         return State(tensors, values)
 
@@ -242,6 +243,11 @@ class SplatModel:
             variance += self._config.low_pass
         squared = finest_pixels(splats.means, cameras_of(self._views)).square()
         return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), variance * squared)[1]
+
+    @property
+    def supersampling(self) -> int:
+        """Samples along each side of a pixel in renders of the finished model."""
+        return self._config.supersampling
 
     def render_options(self, view: View) -> RenderOptions:
         """Return the renderer options for a view."""

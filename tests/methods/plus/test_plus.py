@@ -27,6 +27,7 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.scene import Scene
 from padgs.training.health import Failure
 from padgs.training.loop import Record
+from padgs.training.model import MODEL, State
 from padgs.training.options import Budget, TrainOptions
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, initial_per_pixel=None, limit_per_pixel=None, depth_init_per_pixel=0.0)
@@ -289,3 +290,20 @@ def test_sh_degrees_and_learning_rate_of_means():
     )
     assert torch.allclose(torch.sigmoid(ours.model.splats.opacity_logits), torch.tensor(0.3))
     torch.testing.assert_close(ours.model.splats.log_scales.exp(), 0.5 * usual.model.splats.log_scales.exp())
+
+
+def test_long_runs_and_what_goes_on_from_them_have_several_samples_a_pixel():
+    scene, least = tiny_scene(), PlusOptions().supersampling_iterations
+    method = PlusMethod()
+    short, long = (method.build_model(scene, iterations) for iterations in (least - 1, least))
+    for source, samples in ((short, 1), (long, 2)):
+        assert source.supersampling == samples
+        stored, going_on = source.state(), method.build_model(scene, 10)
+        tensors = {f"{MODEL}{name}": tensor for name, tensor in stored.tensors.items()}
+        assert method.restore(State(tensors, {"model": stored.values})).supersampling == samples
+        going_on.load_model(stored)
+        assert going_on.supersampling == samples
+    single = PlusMethod(render=replace(PlusMethod.RENDER, supersampling=1)).build_model(scene, least)
+    single.load_model(long.state())
+    assert single.supersampling == 1
+    assert PlusMethod(PlusOptions(supersampling_iterations=0)).build_model(scene, 1).supersampling == 2
