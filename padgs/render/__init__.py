@@ -16,7 +16,7 @@ from padgs.gaussians import Gaussians
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
 from padgs.render.ray_blocks import is_in_blocks, rasterize_blocks, seen
-from padgs.render.supersampling import is_supersampled, rasterize_samples
+from padgs.render.supersampling import rasterize_samples
 from padgs.scene import View
 
 BACKENDS = {
@@ -75,7 +75,7 @@ def render(
     """
     request = make_request(gaussians, view, options, background, mean_offsets, absgrad)
     name = resolve_backend(backend, gaussians.means)
-    if is_supersampled(request):
+    if options.supersampling > 1:
         return rasterize_samples(partial(_rasterize, name), request)
     return _rasterize(name, request)
 

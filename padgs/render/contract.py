@@ -50,7 +50,7 @@ class RenderOptions:
     near_cull: str = "mean"  # what must be farther than near: the mean, or ellipsoid (ray): the whole drawn Gaussian
     # variance of the low-pass filter in square pixels (cubemap: of its panorama; perspective image: at its centre)
     low_pass: float = 0.3
-    # n x n samples a pixel, which is their mean; `low_pass` is then in square samples. The rays of a table have one.
+    # n x n samples a pixel, which is their mean; `low_pass` is then in square samples
     supersampling: int = 1
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none

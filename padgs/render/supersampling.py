@@ -6,18 +6,13 @@ is filtered, is wrong where edges of opaque Gaussians cross the pixel.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import lru_cache, reduce
 
 import torch
 from torch import Tensor
 
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.render.contract import Rendering, Request
-
-
-def is_supersampled(request: Request) -> bool:
-    """Return whether pixels have several samples; the rays of a table are given, one a pixel."""
-    return request.options.supersampling > 1 and not isinstance(request.camera, RayTable)
 
 
 def rasterize_samples(rasterize: Callable[[Request], Rendering], request: Request) -> Rendering:
@@ -41,10 +36,25 @@ def rasterize_samples(rasterize: Callable[[Request], Rendering], request: Reques
 
 
 def with_smaller_pixels(camera: Camera, times: int) -> Camera:
-    """Return a panorama or pinhole with `times` the columns and rows, which sees the same."""
+    """Return a camera with `times` the columns and rows, which sees the same; between rays of a table, linearly."""
     width, height = times * camera.width, times * camera.height
     if isinstance(camera, Panorama):
         return Panorama(width, height)
-    assert isinstance(camera, Pinhole), f"{type(camera).__name__} has no smaller pixels"
-    lens = {name: times * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
-    return replace(camera, width=width, height=height, **lens)
+    if isinstance(camera, Pinhole):
+        lens = {name: times * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+        return replace(camera, width=width, height=height, **lens)
+    return _finer_table(camera, times) if camera.table.requires_grad else _kept_table(camera, times)
+
+
+def _finer_table(camera: RayTable, times: int) -> RayTable:
+    rays = camera.table
+    offsets = (torch.arange(times, dtype=rays.dtype, device=rays.device) + 0.5) / times - 0.5  # from pixel centres
+    for dim in (0, 1):
+        slope = torch.gradient(rays, dim=dim)[0] if rays.shape[dim] > 1 else torch.zeros_like(rays)
+        slope = slope.nan_to_num()  # beside a ray that is none
+        rays = rays.unsqueeze(dim + 1) + offsets[:, None].view(-1, *(1,) * (2 - dim)) * slope.unsqueeze(dim + 1)
+        rays = rays.flatten(dim, dim + 1)
+    return RayTable(torch.nn.functional.normalize(rays, dim=-1), times * camera.focal, camera.kind)
+
+
+_kept_table = lru_cache(maxsize=16)(_finer_table)  # views of a camera share it

@@ -39,7 +39,7 @@ def test_an_exported_run_scores_like_the_run(splat_run):
     assert result.exit_code == 0 and "Gaussians as trained" in result.output
     run = padgs.load_run(splat_run)
     splats = read_splats(splat_run / "splats.ply", unit=run.scene.scale)
-    options = run.config.render.options(run.scene.scale)
+    options = run.method.model.render_options(run.scene.test[0])
     again = evaluate(lambda view: render(splats.gaussians(view), view, options), run.scene.test, RULES)
     plain = run.method.model.splats
     same = evaluate(lambda view: render(plain.gaussians(view), view, options), run.scene.test, RULES)
