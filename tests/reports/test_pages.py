@@ -53,6 +53,30 @@ def test_the_table_of_padgs_plus(root, after_a_minute):
         assert rows[title] == [" / ".join(format(value, shown) for value in pair) for pair in pairs], title
 
 
+def test_the_long_runs_of_padgs_plus(root):
+    blocks = (root / "reports/measured/order.md").read_text().split("### ")
+    rows = {row[0]: row[1:] for row in map(cells, (root / "docs/plus.md").read_text().splitlines()) if row}
+    methods = ("padgs+", TUNED, "SPaGS, also its supersampling", "padgs+, one sample a pixel", "SPaGS")
+    shown = {
+        "`basement`, `plaza`: WS-PSNR": (WS_PSNR, ".2f", 1),
+        "CPU seconds": ("CPU s ↓", ".0f", 1),
+        "Gaussians / 1000": (COUNT, ".0f", 1e-3),
+        "frame, ms": ("ms per frame ↓", ".0f", 1),
+    }
+    found = []
+    for scene in ("basement", "plaza"):
+        title = rf"all\_methods: {scene} (never seen), 256x128, 3000 iterations"
+        block = next(block for block in blocks if block.startswith(title))
+        head, _, *lines = (cells(line) for line in block.splitlines() if line.startswith("|"))
+        found.append({line[0].partition(" (n=")[0]: dict(zip(head, line, strict=True)) for line in lines})
+    for title, (column, form, factor) in shown.items():
+        values = [[f"{factor * float(of[m][column].split()[0]):{form}}" for of in found] for m in methods]
+        assert rows[title] == [", ".join(pair) for pair in values], title
+    leads = [float(of["padgs+"][WS_PSNR].split()[0]) - float(of[TUNED][WS_PSNR].split()[0]) for of in found]
+    for page in ("README.md", "docs/plus.md"):
+        assert f"{leads[0]:.1f} and {leads[1]:.1f} dB" in " ".join((root / page).read_text().split()), page
+
+
 def test_the_answers_of_the_readme(root, after_a_minute):
     of, scenes = after_a_minute, list(SCENES)
     never = scenes[:3]
