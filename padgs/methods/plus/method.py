@@ -60,7 +60,7 @@ class PlusOptions(SplatOptions):
     initial_scale: float = 0.6
     limit_per_pixel: float | None = 2.6
     supersampling_from: float = 0.7
-    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel: time fits more than samples do
+    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel: fitting needs their time
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large
