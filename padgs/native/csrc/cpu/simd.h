@@ -82,7 +82,6 @@ PADGS_INLINE Vec vec(__m512 v) { return {{(Part)v}}; }
 PADGS_INLINE Mask less(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw(b), _CMP_LT_OQ); }
 PADGS_INLINE Mask at_least(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw(b), _CMP_GE_OQ); }
 PADGS_INLINE Mask at_most(VecI a, VecI b) { return _mm512_cmple_epi32_mask((__m512i)a.p[0], (__m512i)b.p[0]); }
-PADGS_INLINE Mask equal(VecI a, VecI b) { return _mm512_cmpeq_epi32_mask((__m512i)a.p[0], (__m512i)b.p[0]); }
 PADGS_INLINE Mask both(Mask a, Mask b) { return a & b; }
 PADGS_INLINE Mask either(Mask a, Mask b) { return a | b; }
 PADGS_INLINE Mask without(Mask a, Mask b) { return a & ~b; }
@@ -114,7 +113,6 @@ struct Mask {
 PADGS_INLINE Mask less(Vec a, Vec b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] < b.p[i]; return r; }
 PADGS_INLINE Mask at_least(Vec a, Vec b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] >= b.p[i]; return r; }
 PADGS_INLINE Mask at_most(VecI a, VecI b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] <= b.p[i]; return r; }
-PADGS_INLINE Mask equal(VecI a, VecI b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] == b.p[i]; return r; }
 PADGS_INLINE Mask both(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] & b.p[i]; return r; }
 PADGS_INLINE Mask either(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] | b.p[i]; return r; }
 PADGS_INLINE Mask without(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] & ~b.p[i]; return r; }
