@@ -60,7 +60,8 @@ class PlusOptions(SplatOptions):
     initial_scale: float = 0.6
     limit_per_pixel: float | None = 2.6
     supersampling_from: float = 0.7
-    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel: fitting needs their time
+    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel, because fitting needs their time,
+    supersampling_share: float = 0.25  # unless several change the views by this share of their squared error
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large
@@ -72,7 +73,7 @@ class PlusOptions(SplatOptions):
         thresholds = ("threshold_pixel_exponent", "threshold_full_views")
         off = "at least 0, which switches it off"
         check(self, off, lambda value: 0 <= value < math.inf, "smoothness_weight", *thresholds)
-        check(self, "at least 0", lambda least: least >= 0, "supersampling_iterations")
+        check(self, "at least 0", lambda least: least >= 0, "supersampling_iterations", "supersampling_share")
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "dropout")
         for field in fields(DensificationOptions):

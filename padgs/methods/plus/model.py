@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,9 @@ from padgs.methods.splats.smoothing_filter import cameras_of, finest_pixels, smo
 from padgs.methods.splats.splats import TINY, Splats
 from padgs.render import RenderConfig
 from padgs.scene import View
+from padgs.training.loss import squared_error
 from padgs.training.model import State, TrainingRender
+from padgs.training.targets import even_weight, image_of
 
 if TYPE_CHECKING:
     from padgs.methods.plus.method import PlusOptions
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 DEGREE_SHARE = 0.1  # of the run, between two SH degrees
 DROPOUT_UNTIL = 0.9  # share of the run after which no Gaussians are dropped
 SMOOTH_UP_TO = 4.0  # scene scales; surfaces farther away are smoothed less
+COMPARED_VIEWS = 4  # at most, drawn with one sample a pixel and with several
 CAMERAS = "cameras"  # key of the training cameras in a state
 
 
@@ -44,6 +48,27 @@ class PlusModel(SplatModel):
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
         self._finest: tuple[Tensor, Tensor] | None = None  # means, and the finest training pixel at each
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        events, begin = super().adapt(iteration, optimizer), max(1.0, self._supersampling_from * self.iterations)
+        several = self._long_config.supersampling
+        if several > self.supersampling and iteration - 1 < begin <= iteration and self._gains_by_supersampling():
+            self._config = self._long_config
+            events += (f"{several}x{several} samples a pixel",)
+        return events
+
+    @torch.no_grad()
+    def _gains_by_supersampling(self) -> bool:
+        """Return whether it changes training views by at least `supersampling_share` of their squared error."""
+        change, error = 0.0, 0.0
+        for view in self._views[:: math.ceil(len(self._views) / COMPARED_VIEWS)]:
+            gaussians, scale = self.splats.gaussians(view), self.splats.scene_scale
+            one = self._rendered(gaussians, view, self._config.options(scale)).image
+            several = self._rendered(gaussians, view, self._long_config.options(scale)).image
+            target, weight = image_of(view, one.device), even_weight(view, one.device)
+            change += view.sphere_share * squared_error(several, one, weight).item()
+            error += view.sphere_share * squared_error(target, one, weight).item()
+        return change >= self.options.supersampling_share * error
 
     def degree_at(self, iteration: int) -> int:
         """Return the scheduled SH degree: one more after each `DEGREE_SHARE` of the run."""

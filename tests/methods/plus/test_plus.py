@@ -24,7 +24,8 @@ from padgs.methods.plus.smoothness import roughness
 from padgs.methods.splats.depth_initialization import MIN_PIXELS, solid_angle_pixels
 from padgs.methods.splats.importance import count_for_psnr, importance_scores
 from padgs.methods.splats.method import SplatMethod
-from padgs.scene import Scene
+from padgs.render import render
+from padgs.scene import Scene, View
 from padgs.training.health import Failure
 from padgs.training.loop import Record
 from padgs.training.model import MODEL, State
@@ -307,3 +308,34 @@ def test_long_runs_and_what_goes_on_from_them_have_several_samples_a_pixel():
     single.load_model(long.state())
     assert single.supersampling == 1
     assert PlusMethod(PlusOptions(supersampling_iterations=0)).build_model(scene, 1).supersampling == 2
+
+
+@pytest.mark.parametrize(("share", "samples"), [(0.0, 2), (1e9, 1)])
+def test_short_runs_have_several_samples_where_these_change_much_of_the_error(share, samples):
+    scene, options = tiny_scene(), replace(OPTIONS, supersampling_share=share)
+    method, resumed, decided = PlusMethod(options), PlusMethod(options), math.ceil(OPTIONS.supersampling_from * 20)
+    for record in method.fit(scene, Budget(20)):
+        assert method.model.supersampling == (samples if record.iteration >= decided else 1)
+        assert (f"{samples}x{samples} samples a pixel" in record.events) == (
+            samples > 1 and record.iteration == decided
+        )
+        if record.iteration == decided + 1:
+            resumed.load_state(method.state())
+    list(resumed.fit(scene, Budget(20)))
+    assert resumed.model.supersampling == samples
+    assert_same_but_time(resumed.state(), method.state())
+
+
+@pytest.mark.parametrize(("share", "gains"), [(0.8, True), (1.25, False)])
+def test_the_change_by_samples_is_relative_to_the_error(share, gains):
+    """Where the images are what several samples give, the change is the error."""
+    scene, method = tiny_scene(), PlusMethod(replace(OPTIONS, supersampling_share=share))
+    several = replace(PlusMethod.RENDER, supersampling=2).options(scene.scale)
+
+    def as_rendered(view: View) -> View:
+        image = render(method.build_model(scene, 20).splats.gaussians(view), view, several).image.detach()
+        return replace(view, load_pixels=lambda: (255 * image.clamp(0, 1)).round().byte())
+
+    views = tuple(map(as_rendered, scene.train))
+    model = method.build_model(replace(scene, train=views), 20)
+    assert model._gains_by_supersampling() == gains
