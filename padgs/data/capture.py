@@ -162,7 +162,7 @@ _CHOICES = {"split": ("auto", "files", "every", "all"), "depth": ("auto", "none"
 class DataSettings:
     """The `data` group of the configuration, as far as users set it."""
 
-    dataset: str | None = None  # a name of DATASETS, which defines mask, size and source
+    dataset: str | None = None  # roam360 | ricoh360 | omniblender | ob3d | tartanair: defines mask, size and source
     width: int | None = None  # panoramas are reduced to this width by an area filter; None = as stored
     images: str | None = None  # image folder, relative to the data set's; None = search
     points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative to the data set's folder

@@ -35,7 +35,7 @@ class RenderConfig(RenderOptions):
 
     near: float = 0.01  # smallest distance that is drawn, in `near_unit`
     near_unit: str = "scene"  # scene: multiples of Scene.scale; world: world units, as the published code
-    backend: str = "auto"  # a name of `BACKENDS`, or auto
+    backend: str = "auto"  # auto | torch | cpu | cuda
 
     def __post_init__(self) -> None:
         check_known(self, projection=LOW_PASS_KINDS, near_unit=NEAR_UNITS, backend=("auto", *BACKENDS))

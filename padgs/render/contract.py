@@ -45,7 +45,7 @@ LOW_PASS_KINDS = {  # of each projection, the default first; defined in `padgs.r
 class RenderOptions:
     """Options of the rasterizer. conf/render/released.yaml has those of the published rasterizer."""
 
-    projection: str = "erp"  # a name of `padgs.render.projection.PROJECTIONS`
+    projection: str = "erp"  # erp | tangent | ray | pinhole: docs/renderer.md
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     near_cull: str = "mean"  # what must be farther than near: the mean, or ellipsoid (ray): the whole drawn Gaussian
     # variance of the low-pass filter in square pixels (cubemap: of its panorama; perspective image: at its centre)
@@ -55,7 +55,7 @@ class RenderOptions:
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none
     cubemap: bool = False  # render a panorama from the six faces of a cube, each a perspective view
-    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `square_boxes`
+    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 standard deviations, as published
     blending: str = "sorted"  # sorted: by distance of means; hybrid: nearest fragments of each ray sorted, others not
     core_size: int = CORE_SIZE  # hybrid: number of sorted fragments of a pixel
     max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; more are rendered in strips

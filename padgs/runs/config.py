@@ -35,7 +35,7 @@ CONTINUED = "continued"  # label of runs with `init` in tables
 class DataConfig(DataSettings):
     """The `data` group: the source of the scene."""
 
-    format: str = "synthetic"  # a name of padgs.data.LOADERS
+    format: str = "synthetic"  # auto | synthetic | a format that `padgs convert --help` lists
     path: str | None = None  # folder of the scene; null for a generated scene
     voxel_size: float | str = "auto"  # distance of anchors, as the paper states it for a dataset
 
@@ -135,7 +135,7 @@ class Settings:
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0  # random seed of training, such as of the order of views
     init: WarmStart | None = None  # a finished run of the same method and scene whose model training begins with
-    retry: str = "none"  # finished runs to start again: a name of RETRIES
+    retry: str = "none"  # none | failed: finished runs to start again
     smallest: str = "off"  # on: search for the smallest model after the run, as padgs smallest does
 
     def __post_init__(self) -> None:

@@ -72,7 +72,7 @@ class TrainOptions:
     lambda_l1: float = 0.8  # lambda of Eq. 16
     square_weight: float = 0.0  # weight of the squared error, added to the loss in the last 40 % of a run
     adam_beta2: float = 0.999  # decay of Adam's second moments
-    weight: str = "solid_angle"  # M of Eq. 17, see `padgs.training.loss.ROW_WEIGHTS`
+    weight: str = "solid_angle"  # M of Eq. 17: solid_angle | uniform | end_rows (as released: 0 at the poles)
     normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
     # published: for 30 000 iterations | run: for the length of this run, see `padgs.training.schedule.Pace` |
     # run_linear: the law that run stands for with OmniGS, ODGS and OP43DGS |

@@ -25,7 +25,7 @@ class StressOptions:
     ('few_views 2', '')
     """
 
-    condition: str = NONE  # a name of `CONDITIONS`
+    condition: str = NONE  # none, or a fault of captures such as pose_noise: docs/robustness.md
     level: int = 1  # from 1, mild, to 3, severe; 0: unperturbed
 
     def __post_init__(self) -> None:

@@ -42,7 +42,7 @@ class SyntheticOptions:
     not depend on it. Pose noise, the two lenses and the figure affect training views only.
     """
 
-    scene: str = "room"  # a name of `padgs.data.synthetic.SCENES`
+    scene: str = "room"  # room | outdoor | glossy | ...: those of +scene=synthetic_NAME
     width: int = 512  # pixels; the height is half of it
     train_views: int = 24  # number, along the path
     test_views: int = 6  # spread evenly between the training views along the path

@@ -47,7 +47,7 @@ class PlusOptions(SplatOptions):
 
     sh_degree: int = 2  # one more each tenth of the run; degree 3 gains nothing and costs a fifth of the time
     positional_gradient: str = "space_absolute"
-    gradient_threshold: float = 5e-5  # that of SPaGS; adapted by `for_run` and `for_views`
+    gradient_threshold: float = 5e-5  # that of SPaGS; adapted to iterations, pixels and views (docs/plus.md)
     threshold_pixel_exponent: float = 1.0  # threshold ~ pixel width ^ exponent, for views above 256x128; 0: constant
     threshold_full_views: int = 28  # fewer views lower the threshold less, by sqrt(views / this); 0: never less
     sample_clones: bool = True
@@ -65,8 +65,8 @@ class PlusOptions(SplatOptions):
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large
-    smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces with few views, see `smoothness`
-    dropout: float = 0.1  # maximal share of Gaussians dropped from a training render, see `dropout_share`
+    smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces; less above 8 views, 0 from 16
+    dropout: float = 0.1  # maximal share of Gaussians dropped from a render; 0 from 16 training pixels per Gaussian on
 
     def __post_init__(self) -> None:
         super().__post_init__()

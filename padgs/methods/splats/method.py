@@ -41,7 +41,7 @@ class SplatOptions(DensificationOptions, ExtentOptions):
     sky_per_point: float = 0.0  # directions per initial point that get a far Gaussian if no point is there
     limit_per_pixel: float | None = None  # maximal Gaussians per independent pixel, which bounds memory and time
     means_rate_factor: float = 1.0  # factor on the learning rate of the means in 3DGS
-    prune_psnr: float | None = None  # dB of the pruning step, see `count_for_psnr`; None: by `budget.gaussians` only
+    prune_psnr: float | None = None  # dB to which the least important are pruned; None: by `budget.gaussians` only
     supersampling_from: float = 0.0  # share of the run with one sample a pixel, before `render.supersampling` acts
     # Variance in square pixels of the finest training view (3D smoothing filter of Mip-Splatting and SPaGS,
     # `padgs.methods.splats.smoothing_filter`); 0: none.
