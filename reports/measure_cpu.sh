@@ -21,7 +21,7 @@ plan() {
   cat <<END
 A $six 33 240 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 method=$described,spags_supersampled,padgs_plus_one_sample
 A $six 5 570 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0 method=$released,egonerf_small
-C $six 27 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described
+C $six 30 90 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 method=$described,spags_supersampled
 L bedroom,basement,plaza 18 330 +experiment=equal_time budget.seconds=300 budget.clock=cpu data.width=512 seed=0,1,2 method=omnigs,spags,spags_tuned,spags_supersampled,padgs,padgs_plus
 D bedroom,basement,court 12 350 +experiment=ablation train.iterations=3000 data.width=256 seed=0,1,2
 D bedroom,basement,court 21 350 +experiment=ladder train.iterations=3000 data.width=256 seed=0,1,2
