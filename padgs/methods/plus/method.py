@@ -60,8 +60,8 @@ class PlusOptions(SplatOptions):
     initial_scale: float = 0.6
     limit_per_pixel: float | None = 2.6
     supersampling_from: float = 0.7
-    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel, because fitting needs their time,
-    supersampling_share: float = 0.25  # unless several change the views by this share of their squared error
+    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel but for `supersampling_share`
+    supersampling_share: float = 0.25  # a shorter run has several if they change its views by this share of the error
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large
