@@ -18,7 +18,7 @@ from padgs.cli.report import report
 from padgs.cli.score import score
 from padgs.cli.view import view
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")  # which joins the lines of a paragraph
 
 
 def show_version(requested: bool) -> None:

@@ -102,3 +102,8 @@ def test_output_that_nobody_reads_ends_the_command_in_silence(root):
     done = subprocess.run([sys.executable, "-c", code], stdout=writing, stderr=subprocess.PIPE, cwd=root)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, b"")
+
+
+def test_help_breaks_lines_where_the_terminal_ends(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "explicit ones; the loss is measured, printed and written into the file." in run("export", "--help").output
