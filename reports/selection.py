@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from importlib import import_module
+from itertools import chain
 from typing import Any
 
 import pandas as pd
@@ -207,7 +208,8 @@ def settings(runs: DataFrame) -> list[Setting]:
     found = []
     for preset in methods.ordered(runs["preset"]):
         own = runs.loc[runs["preset"] == preset]
-        keys = [key for key in differing_keys(own.loc[own["variant"] == own["variant"].iloc[0]]) if key != "variant"]
+        alike = (differing_keys(runs_of) for _, runs_of in grouped(own, "variant"))
+        keys = [key for key in dict.fromkeys(chain.from_iterable(alike)) if key != "variant"]
         made = [
             Setting(preset, variant, {key: group[CONFIG + key].iloc[0] for key in keys}, group)
             for (variant, _), group in grouped(own, "variant", "setting")

@@ -38,15 +38,17 @@ def failures(runs: DataFrame) -> str:
 def over_scenes(runs: DataFrame, scenes: Sequence[Place], measures: Sequence[Measure]) -> list[Cell]:
     """Return a cell for each measure: mean over scenes, standard deviation over seeds that every scene has.
 
-    Missing if any scene has no number, because means over different scenes cannot be compared.
+    Missing if any scene has no number, because means over different scenes cannot be compared. The status of failed
+    runs stands beside it, since their seeds are left out.
     """
+    failed = failures(runs.loc[runs["place"].isin(scenes)])
     by_seed: dict[int, dict[Place, NDArray]] = {}
     for seed, place, numbers in zip(runs["seed"], runs["place"], numbers_of(runs, measures), strict=True):
         by_seed.setdefault(seed, {})[place] = numbers
     complete = [[of[place] for place in scenes] for _, of in sorted(by_seed.items()) if of.keys() >= {*scenes}]
     means = [[math.fsum(numbers) / len(scenes) for numbers in zip(*of, strict=True)] for of in complete]
     known = ([mean for mean in of if not math.isnan(mean)] for of in zip(*means, strict=True))
-    return list(map(mean_cell, known)) if complete else [Cell() for _ in measures]
+    return [mean_cell(mean, failed) for mean in known] if complete else [Cell(status=failed) for _ in measures]
 
 
 def numbers_of(runs: DataFrame, measures: Sequence[Measure]) -> NDArray:

@@ -97,3 +97,22 @@ def test_means_over_scenes_are_of_one_size_and_length():
     assert [block.title for block in equal_time(run_set(made[:3])).blocks] == [
         "synthetic-room (generated), 512x256, 60 s of CPU time"
     ]
+
+
+def test_failed_runs_are_named_beside_the_mean_over_scenes_that_leaves_out_their_seeds():
+    every = [
+        small(25.0 + seed, scene=scene, dataset="", fingerprint=scene, seed=seed)
+        for scene in ("hall", "attic")
+        for seed in range(3)
+    ]
+
+    def mean(*seeds: int) -> list[str]:
+        """Return the row of the mean if these seeds fail on one of the scenes."""
+        made = [replace(of, status="nan", scores={}) if of.scene == "hall" and of.seed in seeds else of for of in every]
+        first = table1(run_set(made)).blocks[0]
+        assert first.title == "Average over 2 scenes: attic, hall"
+        return first.rows[0].texts(table1(run_set(made)).columns)
+
+    assert mean()[::2] == ["PaD-GS (n=3)", "26.00 ± 1.00"]
+    assert mean(2)[::2] == ["PaD-GS (n=2)", "25.50 ± 0.71 [NAN]"]
+    assert mean(1, 2)[::2] == ["PaD-GS", "25.00 [NAN]"] and mean(0, 1, 2)[::2] == ["PaD-GS", "NAN"]

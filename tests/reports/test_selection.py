@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import pytest
 from pandas import DataFrame
 from support.made_up import run_set, small
 
-from padgs.reports.selection import Mixture, one_setting, separate
+from padgs.reports.selection import Mixture, one_setting, separate, settings
 
 
 def refused(*options) -> tuple[DataFrame, Mixture]:
@@ -34,3 +36,14 @@ def test_seeds_from_before_and_after_a_key_existed_have_rows_of_their_own():
     of = run_set([small(25.0, seed=seed, config={"method": own}) for seed, own in enumerate(({}, {"share": 0.3}))])
     assert [row.title for row in of.report("methods").blocks[0].rows] == ["PaD-GS, share 0.3", "PaD-GS, share not set"]
     assert "differ in method.share" in "".join(of.warnings)
+
+
+def test_settings_of_a_variant_have_different_titles_though_another_variant_has_one_setting():
+    own = {"": (0.9,), "a1": (0.5, 0.9)}
+    runs = [
+        replace(small(25.0), variant=name, run=f"{name}_{tau}", config={"method": {"tau": tau}})
+        for name, of in own.items()
+        for tau in of
+    ]
+    titles = [setting.title for setting in settings(run_set(runs).runs)]
+    assert titles == ["PaD-GS, tau 0.9", "PaD-GS, a1, tau 0.5", "PaD-GS, a1, tau 0.9"]
