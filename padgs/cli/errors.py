@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -43,6 +44,7 @@ def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def wrapped(**options: Any) -> None:
+        warnings.formatwarning = lambda message, *_, **__: printable(f"warning: {message}\n")  # without a line of code
         try:
             with ending_by_signals():
                 command(**options)
@@ -61,7 +63,7 @@ def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) 
 
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    if run and isinstance(error, DataError):
+    if run and isinstance(error, DataError) and not str(error).startswith(f"{run} "):  # a file of Gaussians
         runs = " or ".join(filter(None, (run, beside)))
         return f"{error}; it is the data of {runs}: if it has moved, name its place with --data"
     return str(error) or "out of memory"

@@ -56,4 +56,5 @@ def track(
         trackers[experiment].add(folder)
         if not trackers[experiment].on:
             raise typer.Exit(1)
-    show(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")
+    names = {result.run for result in found.values()}  # once, whatever copies there are
+    show(f"mirrored: {len(names)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from padgs import results
+from padgs.checks import ConfigError
 from padgs.data.camera_paths import along_cameras
 from padgs.data.capture import DataError
 from padgs.evaluation.protocols import PROTOCOLS
@@ -169,7 +170,11 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         values["run"]["device"] = device
     except (YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RunFolderError(f"{settings} is not a configuration of padgs-run ({error}); restore it") from error
-    config = config_from_values(values)
+    try:
+        config = config_from_values(values)
+    except ConfigError as error:
+        advice = "another version of padgs wrote it, or it was edited: use that version, or train again"
+        raise ConfigError(f"{settings}: {error}; {advice}") from error
     method = build_method(config)
     digest = checkpoint.digest(store.checkpoint)
     state = checkpoint.load(store.checkpoint, choose_device(device, config.render), run)

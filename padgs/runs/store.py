@@ -213,7 +213,7 @@ def cannot_write(path: Path, error: OSError) -> RunFolderError:
     """Return the error to raise if a run folder or a file beside it cannot be written."""
     return RunFolderError(
         f"cannot write run folder {path}: {error.strerror or error}; "
-        "make room, correct the permissions, or set run.folder to another place"
+        "make room, correct the permissions, or name another place (run.folder; padgs score: --to)"
     )
 
 

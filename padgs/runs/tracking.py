@@ -112,14 +112,14 @@ class Tracker:
     def _add(self, run: Path, result: Result) -> None:
         from mlflow.entities import Metric, Param
 
-        mark = f"{run.name} {result.finished}"
+        mark = f"{result.run} {result.finished}"  # of copies and renamed folders, too
         if self._find(FINISHED, mark):
             return
         words = {"status": result.status, "preset": result.preset, "scene": result.scene, "variant": result.variant}
         words |= {"experiments": " ".join(result.experiments), "reason": result.reason}
         tags = {f"padgs.{key}": value[:LONGEST_VALUE] for key, value in words.items()}
-        tags |= {RUN: run.name} | ({PARENT: self._parent} if self._parent else {})
-        identity = self._create(run.name, tags)
+        tags |= {RUN: result.run} | ({PARENT: self._parent} if self._parent else {})
+        identity = self._create(result.run, tags)
         params = [Param(key, str(value)[:LONGEST_VALUE]) for key, value in results.flat(result.config)]
         for start in range(0, len(params), MOST_PARAMS):
             self._client.log_batch(identity, params=params[start : start + MOST_PARAMS])

@@ -13,7 +13,7 @@ from padgs.reports.frame import by_place, without_data
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, settings
-from padgs.reports.significance import over_scenes
+from padgs.reports.significance import failures, over_scenes
 from padgs.reports.table import Cell
 from padgs.results import file_name
 
@@ -149,10 +149,11 @@ def _is_release(preset: str) -> bool:
 
 def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, equal_images: bool = True) -> TradeOff:
     measures = (*(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/")), *COSTS)
-    found = settings(pd.concat(group.values()))
-    for setting in found:
+    every = settings(pd.concat(group.values()))
+    for setting in every:
         refuse_mixture(setting.runs, request, f"{name}, {setting.title}", OF_A_MEAN)
-    found = [setting for setting in found if setting.runs["ok"].any()]
+    found = [setting for setting in every if setting.runs["ok"].any()]
+    failed = [f"{one.title} ({failures(one.runs).upper()})" for one in every if not one.runs["ok"].any()]
     finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]
     if len(group) == 1:
         finished = list(group)  # a setting that failed has no point
@@ -169,6 +170,7 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
         what = f"{what}, mean over its scenes {named}" if what else f"mean over {named}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol)
+    notes += [f"Every run failed, so there is no point: {'; '.join(failed)}."] if failed else []
     return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes), equal_images)
 
 

@@ -1,12 +1,14 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 from typer.testing import CliRunner
 
 from padgs.cli.commands import app
 from padgs.cli.errors import MAX_THREADS, name_place, without_traceback
+from padgs.data.capture import DataError
 from padgs.files import ImageError
 
 TOO_LARGE = str(10**40)
@@ -88,6 +90,27 @@ def test_errors_are_one_line(error, message, capsys):
     with pytest.raises(RuntimeError):  # `typer.Exit`
         command()
     assert capsys.readouterr().err == f"{message}\n"
+
+
+def test_a_damaged_file_of_gaussians_is_not_taken_for_the_data_of_a_run(capsys):
+    @without_traceback
+    def command(run: str) -> None:
+        raise DataError("a.ply is no PLY file; export it again")
+
+    for run, more in (
+        ("a.ply", ""),
+        ("runs/a", "; it is the data of runs/a: if it has moved, name its place with --data"),
+    ):
+        with pytest.raises(RuntimeError):  # `typer.Exit`
+            command(run=run)
+        assert capsys.readouterr().err == f"error: a.ply is no PLY file; export it again{more}\n"
+
+
+def test_warnings_are_one_line():
+    without_traceback(lambda: None)()
+    assert (
+        warnings.formatwarning("other \x1b data", UserWarning, "file.py", 1, "code()") == "warning: other \\x1b data\n"
+    )
 
 
 def test_a_damaged_image_is_not_blamed_on_the_place(tmp_path):

@@ -9,6 +9,7 @@ import torch
 from support.tiny_run import tiny_run
 
 import padgs
+from padgs.checks import ConfigError
 from padgs.data.camera_paths import PATHS
 from padgs.data.capture import DataError
 from padgs.geometry.camera import Panorama, perspective
@@ -106,6 +107,12 @@ def test_an_unfinished_run_is_loaded(folder, tmp_path):
     [
         ("config.yaml", "seed: 0\nrender", "seed: 0\nrender", None),
         ("config.yaml", "iterations: 30", "iterations: 31", "is of a run with another configuration"),
+        (
+            "config.yaml",
+            "\nseed: 0\n",
+            "\nseed: 0\nnew: 1\n",
+            "config.yaml: unknown key new; .*: use that version, or train",
+        ),
         ("config.yaml", "data:\n", "date:\n", "is not a configuration of padgs-run"),
         ("config.yaml", "data:\n", "data: [\n", "is not a configuration of padgs-run"),
         ("checkpoint/state.json", '"iteration": 30', '"iteration": 29', "was changed after it was written"),
@@ -118,7 +125,7 @@ def test_a_run_that_was_edited_is_refused(folder, tmp_path, file, old, new, erro
     if error is None:
         assert padgs.load_run(copy).result.ok
         return
-    with pytest.raises(RuntimeError, match=error):
+    with pytest.raises((RuntimeError, ConfigError), match=error):
         padgs.load_run(copy)
 
 

@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,15 +66,18 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_and_pictures(tmp_path
     runs = tmp_path / "runs"
     good, bad = make_run(runs), make_run(runs, "room_padgs_2", status="nan")
     monkeypatch.chdir(tmp_path)  # what mlflow writes where it stands would be found here
+    copy = shutil.copytree(good, runs / "the best")
     for _ in range(2):  # the second time as after a restart: everything is found again
         tracker = Tracker(TrackingOptions(), Path("runs"), "tau", said.append, multirun="tau 1234")
         tracker.add(good)
+        tracker.add(copy)
         tracker.add(bad)
         tracker.finish(["ok", "nan"], 2)
     client = mlflow.MlflowClient(f"sqlite:///{runs / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("tau")
-    stored = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
-    assert said == [] and sorted(stored) == ["room_padgs_1", "room_padgs_2", "tau 1234"]
+    every = client.search_runs([experiment.experiment_id])
+    stored = {run.info.run_name: run for run in every}
+    assert said == [] and sorted(run.info.run_name for run in every) == ["room_padgs_1", "room_padgs_2", "tau 1234"]
     run, parent = stored["room_padgs_1"], stored["tau 1234"]
     assert run.data.params == {"method.name": "padgs", "method.tau": "0.9", "seed": "0"}
     assert run.data.metrics["paper/psnr"] == 20 and "paper/ssim" not in run.data.metrics

@@ -173,6 +173,7 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_settings_finished():
     assert numbers(chart)["OmniGS, corrected", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
     (chart,) = trade_offs(run_set(failed(data_set("roam360"), lambda r: r.method == "padgs")))
     assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
+    assert chart.notes[-1] == "Every run failed, so there is no point: PaD-GS (OOM)."
 
 
 @pytest.mark.parametrize(
