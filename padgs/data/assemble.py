@@ -193,7 +193,8 @@ def found_images(capture: Capture) -> Capture:
         if frame.name not in found and not is_inside(frame.name):
             raise DataError(
                 f"the {capture.format} data set {capture.folder} names {frame.name!r}; names must be relative and stay "
-                f"inside the image folder (no '..'), or end like one image in {folder}: remove the leading folders"
+                f"inside the image folder (no '..'), or end like one image in {folder}: remove the leading folders, "
+                "or set data.images"
             )
     if not found:
         return capture
@@ -220,6 +221,9 @@ def _refuse_missing(capture: Capture) -> None:
     remedy = "set data.images to the folder that holds them, or compute poses of the images that exist (padgs prepare)"
     last_names = {PurePosixPath(name).name for name in absent}
     elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).name in last_names), None)
+    above = [image_folder(folder, None) for folder in list(capture.folder.absolute().parents)[:3]]
+    if outside := next((folder for folder in above if (folder / absent[0]).is_file()), None):
+        remedy = f"set data.images to {os.path.relpath(outside, capture.folder)}, which holds {absent[0]}"
     if hint in absent:
         remedy = f"{hint!r} is a pipe, a device or a broken link: put the image in its place"
     elif hint:
@@ -242,7 +246,8 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
                 raise DataError(f"{text}; make them agree")
             continue
         if frame.width != 2 * frame.height or frame.width < 1:
-            raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; a full panorama is 2:1")
+            rule = "a full panorama is 2:1: correct its size"
+            raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; {rule}")
         scales.setdefault(image.width / frame.width, text)
     if len(scales) > 1:
         differ = "; but ".join(list(scales.values())[:2])

@@ -14,6 +14,7 @@ from padgs.data import conventions
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
 from padgs.data.capture import Capture, DataError, DataOptions, Progress, listed, silent, view_name
+from padgs.data.cloud import GREY_POINTS
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
 from padgs.geometry.panorama import project
@@ -85,7 +86,7 @@ def check(
     poses = torch.stack([view.cam_from_world for view in views])
     report.train, report.test = len(scene.train), len(scene.test)
     report.unused = len(capture.frames) - report.train - report.test
-    report.points, report.coloured = len(scene.points), capture.cloud is not None and capture.cloud.colors is not None
+    report.points, report.coloured = len(scene.points), not any(GREY_POINTS in note for note in scene.notes)
     sizes = sorted({(view.width, view.height) for view in views})
     report.resolution = listed(f"{width}x{height}" for width, height in sizes)
     report.notes += scene.notes

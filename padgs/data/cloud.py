@@ -20,7 +20,7 @@ SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
-GREY = 128
+GREY, GREY_POINTS = 128, "points: the cloud has no colours; grey is used"
 
 
 def read_ply(path: Path) -> Cloud:
@@ -92,12 +92,13 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
             data = PlyData.read(BytesIO(header.decode("ascii", "replace").encode("ascii", "replace") + end + rest))
         vertex = data["vertex"]
     except FileNotFoundError as error:
-        raise DataError(f"the point cloud {path} does not exist") from error
+        remedy = "set data.points to a PLY, LAS, LAZ or E57 file, or to random"
+        raise DataError(f"the point cloud {path} does not exist; {remedy}") from error
     except KeyError as error:
         raise DataError(f"{path} has no element 'vertex'; it must be a point cloud") from error
     except (PlyParseError, OSError, ValueError, MemoryError, OverflowError, EOFError) as error:
         why = error or type(error).__name__
-        raise DataError(f"{path} is not a readable PLY file ({why}); export it again") from error
+        raise DataError(f"{path} is not a readable PLY file ({why}); export it again as PLY, LAS or E57") from error
     return vertex, {prop.name for prop in vertex.properties if not isinstance(prop, PlyListProperty)}
 
 
@@ -142,9 +143,9 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
         raise DataError(f"{where} holds no points; {why}: set data.points to a PLY file, or to random")
     if bad := (~points.float().isfinite().all(1)).sum().item():
         raise DataError(f"{bad} of {len(points)} points of {where} are not finite; remove them from the cloud")
-    if colors is None:
+    if colors is None or not colors.any():  # black is what scanners without a camera write
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
-        notes = (*notes, "points: the cloud has no colours; grey is used")
+        notes = (*notes, GREY_POINTS)
     return points.double(), colors, notes
 
 

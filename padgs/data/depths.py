@@ -1,4 +1,4 @@
-"""Depth maps of views: NPY, EXR and 16-bit PNG files, read as distance along the ray in world units.
+"""Depth maps of views: NPY, EXR, TIFF and 16-bit PNG files, read as distance along the ray in world units.
 
 0 and NaN are unknown, infinity is sky. A format states what its files hold; a `depths/` folder of your own states it in
 `depth.json`, as `padgs render --depth` writes it: {"measure": a key of MEASURES, "unit": world units of one step}.
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.checks import install_command
-from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, listed
+from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, first_of, listed
 from padgs.data.images import read_bytes, refused_if_damaged
 from padgs.files import open_image
 from padgs.scene import View
 
 FOLDERS = ("depths", "depth")
 STATEMENT = "depth.json"
-EXTENSIONS = (".npy", ".exr", ".png")
+EXTENSIONS = (".npy", ".exr", ".png", ".tif", ".tiff")
 MEASURES = {
     "ray": "distance along the ray",
     "z": "distance along the axis of the camera",
@@ -117,7 +117,7 @@ def read_depth(file: Path) -> NDArray[np.float32]:
             values = _exr(file)
         else:
             image = open_image(BytesIO(data), file)
-            if not image.mode.startswith("I"):
+            if not image.mode.startswith(("I", "F")):
                 raise DataError(f"{file} has pixels of type {image.mode}; a depth map needs 16 bits, in one channel")
             values = np.asarray(image)
     if values.ndim == 3 and values.shape[2] == 1:
@@ -154,12 +154,11 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
             raise DataError(f"{lost}; copy them, or set data.depth=none")
         return named, capture.depth if named else None, []
     places, notes = (capture.folder, capture.image_folder.parent), []
-    for folder in dict.fromkeys(base / name for base in places for name in FOLDERS):
-        there = {
-            _folded(path.relative_to(folder).with_suffix("")): path
-            for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in EXTENSIONS and path.is_file()
-        }
+    usual = (first_of(base, (name,), Path.is_dir) for base in places for name in FOLDERS)
+    for folder in dict.fromkeys(folder for folder in usual if folder):
+        inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+        maps = [path for path in inside if path.suffix.lower() in EXTENSIONS]
+        there = {_folded(path.relative_to(folder).with_suffix("")): path for path in maps}
         files = {}
         for frame in capture.frames:
             image = PurePosixPath(frame.name)
@@ -168,11 +167,15 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
             if found := next((there[key] for key in keys if key in there), None):
                 files[frame.name] = found
         if files:
-            is_png = any(path.suffix.lower() == ".png" for path in files.values())
-            return files, _stated(folder / STATEMENT, is_png), notes
+            may_be_whole = any(path.suffix.lower() in EXTENSIONS[2:] for path in files.values())
+            return files, _stated(folder / STATEMENT, may_be_whole), notes
         if there:
             examples = f"{next(iter(there.values())).name} for {capture.frames[0].name}"
             notes.append(f"depth: none of the {len(there)} maps in {folder} is named like an image, such as {examples}")
+        elif inside:
+            notes.append(f"depth: {folder} holds no {', '.join(EXTENSIONS)}, such as {inside[0].name}; it is not used")
+    others = (path.name for path in sorted(capture.folder.glob("*")) if path.is_dir() and "depth" in path.name.lower())
+    notes += [f"depth: {name}/ is not used; name it depths/" for name in others if name.lower() not in FOLDERS]
     return {}, None, notes
 
 
@@ -181,14 +184,14 @@ def _folded(name: PurePath) -> str:
     return normalize("NFC", name.as_posix()).casefold()
 
 
-def _stated(file: Path, is_png: bool) -> DepthMeaning:
+def _stated(file: Path, may_be_whole: bool) -> DepthMeaning:
     """Read what the maps of a folder hold; the steps of integers have no usual unit."""
     if not file.is_file():
         raise DataError(f"{file.parent} holds depth maps, but there is no {file.name} that says what they hold; {HOW}")
     try:
         stated = json.loads(read_bytes(file))
         measure = stated["measure"]
-        unit = stated["unit"] if is_png and measure not in RELATIVE else stated.get("unit", 1)
+        unit = stated["unit"] if may_be_whole and measure not in RELATIVE else stated.get("unit", 1)
         if measure not in MEASURES or isinstance(unit, bool) or not 0 < float(unit) < math.inf:
             raise ValueError(f"measure is {measure!r} and unit {unit!r}")
     except (ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:

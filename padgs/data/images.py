@@ -66,7 +66,10 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFi
         may_be_transparent = mode in _ALPHA or "transparency" in image.info
     if panorama:
         refuse_other_shapes(*size, path)
-    if _looks_cut(data) or may_be_transparent:
+    is_cut = _looks_cut(data)
+    if is_cut and data.endswith(bytes(64)):  # decoders take them for pixels
+        raise DataError(f"{path} ends in zeros, as after an interrupted download; copy it again or remove it")
+    if is_cut or may_be_transparent:
         _decode(data, path, "L" if mask else "RGB")
     digest = hashlib.sha256(data).hexdigest()
     return ImageFile(path, *size, digest, crop, conversion is not None, image.format or "")
@@ -116,10 +119,11 @@ def refuse_other_shapes(width: int, height: int, path: Path) -> None:
         ratio = width // height if height and width % height == 0 else 0
         eyes = {1: "one above the other", 4: "side by side"}.get(ratio)
         stereo = f"; if it holds two panoramas {eyes} (stereo), cut out one" if eyes else ""
-        raise DataError(
-            f"{path} is {width}x{height}, which is not 2:1; an equirectangular panorama covers 360 x 180 degrees "
-            f"(a dual-fisheye or cropped image must be stitched or padded first{stereo})"
-        )
+        remedy = f"a dual-fisheye or cropped image must be stitched or padded first{stereo}"
+        if abs(width - 2 * height) <= max(2, width / 50):
+            remedy = f"if it is whole, resize it: `mogrify -resize {2 * round(width / 2)}x{round(width / 2)}! FILE`"
+        what = "an equirectangular panorama covers 360 x 180 degrees"
+        raise DataError(f"{path} is {width}x{height}, which is not 2:1; {what} ({remedy})")
 
 
 def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:

@@ -21,7 +21,7 @@ from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
 from padgs.geometry.distortion import solid_angle_weight
 
-SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
+SCENE_MASKS = ("mask.png", *(f"mask{extension}" for extension in EXTENSIONS))
 MASK_FOLDERS = ("masks", "mask")
 MIN_VISIBLE = 0.01  # of the sphere; with less, training has no signal and metrics are undefined
 MAX_HIDDEN = 0.75  # share of the sphere that a sound mask hides at most: tripod, sky, what a part of a panorama lacks
@@ -180,7 +180,8 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
     beside, listings = given == capture.image_folder, {}
     found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside, listings))}
     if beside and not found:
-        return {}, None
+        others = [path.name for path in sorted(capture.folder.glob("*")) if re.search("mask|segm", path.name, re.I)]
+        return {}, f"masks: not used: {listed(others)}; name one with data.mask" if others else None
     if not found:
         such = f"named like an image (such as {capture.frames[0].name}.png)"
         raise DataError(f"{given} holds no mask {such}; rename them, or set data.mask=none")

@@ -9,6 +9,7 @@ from padgs.data.capture import DataError, listed
 from padgs.data.images import EXTENSIONS, read_bytes
 
 MAX_NAME_BYTES = 255  # of a file name
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # first bytes of what Windows calls Unicode
 LISTS = {"train": "train.txt", "test": "test.txt"}
 
 
@@ -71,9 +72,10 @@ def read_list(path: Path) -> tuple[str, ...]:
 
 
 def read_lines(path: Path, errors: str = "strict") -> list[str]:
-    """Read the lines of a text file in UTF-8; `errors` is that of `bytes.decode`."""
+    """Read the lines of a text file in UTF-8, or UTF-16 with its mark; `errors` is that of `bytes.decode`."""
+    data = read_bytes(path, empty=True)
     try:
-        return read_bytes(path, empty=True).decode("utf-8-sig", errors).splitlines()
+        return data.decode("utf-16" if data.startswith(UTF_16) else "utf-8-sig", errors).splitlines()
     except UnicodeDecodeError as error:
         raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as UTF-8") from error
 

@@ -112,6 +112,42 @@ def test_missing_scenes_and_unknown_formats_are_refused(tmp_path: Path) -> None:
         load(tmp_path, "colmpa")
 
 
+def test_files_and_folders_beside_a_data_set_lead_to_it(folder: Path, tmp_path: Path) -> None:
+    for part in ("images", "sparse", "sparse/0/images.txt"):
+        with pytest.raises(DataError, match=f"{part} has no known format, but {folder} has: give that"):
+            load(folder / part)
+    with pytest.raises(DataError, match="poses have no image .*; set data.images to ../../images, which holds pano"):
+        load(folder / "sparse/0")
+    assert load(folder / "sparse/0", images="../../images").fingerprint
+    (tmp_path / "up" / "more").mkdir(parents=True)
+    folder = folder.rename(tmp_path / "up/more/scene")
+    with pytest.raises(DataError, match=f"up has no known format, but {folder} has: give that"):
+        load(tmp_path / "up")
+
+
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [
+        ("sfm_data.bin", "make sfm_data.json of it with openMVG_main_ConvertSfM_DataFormat"),
+        ("scan.psx", "open it in Metashape, and export cameras.xml"),
+        ("scan.zip", "unpack it"),
+        ("transforms_360.json", "call it .* transforms.json"),
+    ],
+)
+def test_files_in_another_form_are_named_with_a_way_out(name: str, way: str, tmp_path: Path) -> None:
+    (tmp_path / name).touch()
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(DataError, match=f"has no known format, but {name}: {way}"):
+            load(path)
+
+
+def test_several_files_of_metashape(tmp_path: Path) -> None:
+    for name in ("a.xml", "b.xml"):
+        (tmp_path / name).write_text("<document><chunk/></document>")
+    with pytest.raises(DataError, match=r"no known format, but .*a.xml, .*b.xml have: give one"):
+        load(tmp_path)
+
+
 def test_missing_published_data_sets_name_their_source(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"360Roam is missing.*huajianup.* put it into .*360Roam, .*pose_c2w.json"):
         load(tmp_path / "360Roam" / "bar")

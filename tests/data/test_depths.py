@@ -199,6 +199,21 @@ def test_unknown_or_damaged_depths_are_refused(statement, values, message, world
         load(tmp_path)
 
 
+def test_depth_maps_in_tiff_files_and_folders_that_are_not_used(world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    for folder in (tmp_path / "Depths", tmp_path / "lidar_depth"):
+        folder.mkdir()
+    np.savez(tmp_path / "Depths" / f"{world.names[0]}.npz", truth(world, 0))
+    notes = load(tmp_path).notes
+    assert any("Depths holds no .npy, .exr, .png, .tif, .tiff, such as" in note for note in notes)
+    assert "depth: lidar_depth/ is not used; name it depths/" in notes
+    Image.fromarray(truth(world, 0).numpy().astype(np.float32)).save(tmp_path / "Depths" / f"{world.names[0]}.tif")
+    (tmp_path / "Depths" / "depth.json").write_text('{"measure": "ray", "unit": 2}')
+    scene = load(tmp_path)
+    view = next(view for view in (*scene.train, *scene.test) if view.name == world.names[0])
+    torch.testing.assert_close(view.load_depth(), 2 * truth(world, 0).float())
+
+
 def test_depths_are_checked_against_the_points_and_converted(world: World, tmp_path: Path):
     write_colmap_text(world, tmp_path / "a")
     (tmp_path / "a" / "depths").mkdir()

@@ -79,6 +79,24 @@ def test_truncated_jpegs_with_an_end_marker_are_refused_by_decode(options, tmp_p
         decode(path)
 
 
+@pytest.mark.parametrize("extension", ["jpg", "png"])
+def test_files_that_end_in_zeros_are_refused(extension: str, tmp_path: Path) -> None:
+    path = _save(tmp_path / f"a.{extension}", PANORAMA)
+    data = path.read_bytes()
+    path.write_bytes(data + bytes(300))
+    assert inspect(path).width == 128
+    path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    with pytest.raises(DataError, match=r"a.\w+ ends in zeros, as after an interrupted download; copy it again"):
+        inspect(path)
+
+
+@pytest.mark.parametrize("width", [127, 129])
+def test_images_that_are_nearly_2_to_1_are_to_be_resized(width: int, tmp_path: Path) -> None:
+    path = _save(tmp_path / "a.png", PANORAMA.resize((width, 64)))
+    with pytest.raises(DataError, match=r"not 2:1; .* \(if it is whole, resize it: `mogrify -resize 128x64! FILE`\)"):
+        inspect(path)
+
+
 def test_a_grey_nadir_is_not_taken_as_truncation(tmp_path: Path) -> None:
     pixels = PIXELS.copy()
     pixels[-20:] = 128

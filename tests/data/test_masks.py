@@ -47,7 +47,8 @@ def test_one_mask_for_the_scene(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     "file",
-    [f"{folder}/{name}" for folder in ("masks", "mask") for name in ("pano_00.png", "pano_00.png.png", "PANO_00.BMP")]
+    [f"mask{extension}" for extension in (".tif", ".jpeg", ".webp")]
+    + [f"{folder}/{name}" for folder in ("masks", "mask") for name in ("pano_00.png", "pano_00.png.png", "PANO_00.BMP")]
     + [
         "masks/pano_00_mask.jpg",
         "images/pano_00_mask.png",
@@ -64,6 +65,12 @@ def test_habits_of_other_programs(file: str, folder: Path) -> None:
     assert views["pano_02"].mask() is None and len(views) == 6
     assert any(note.startswith(f"masks: {file.split('/')[0]}/ for 1 of 6 views") for note in scene.notes)
     assert not any("no pose" in note for note in scene.notes)
+
+
+def test_masks_in_folders_of_other_names_are_noted(folder: Path) -> None:
+    _mask(folder / "sam_masks" / "pano_00.png")
+    assert "masks: not used: sam_masks; name one with data.mask" in load(folder).notes
+    assert "masks: sam_masks/ for 1 of 6 views" in load(folder, mask="sam_masks").notes
 
 
 def test_inverted_masks_are_asked_about_and_inverted(folder: Path) -> None:

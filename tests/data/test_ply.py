@@ -6,8 +6,8 @@ import pytest
 import torch
 from support.fixtures import World, write_cloud
 
-from padgs.data.capture import Cloud, DataError
-from padgs.data.cloud import read_ply, write_ply
+from padgs.data.capture import Capture, Cloud, DataError
+from padgs.data.cloud import GREY_POINTS, initial_cloud, read_ply, write_ply
 from padgs.data.formats.json_file import read_json
 
 
@@ -122,6 +122,14 @@ def test_colours_of_gaussians_and_packed_colours(tmp_path: Path) -> None:
     for name, values in (("rgb", packed.view(np.float32)), ("rgba", packed)):
         path = _write(tmp_path / "a.ply", {name: ("f4" if name == "rgb" else "u4", list(values))})
         assert read_ply(path).colors.tolist() == [[10, 20, 30], [90, 90, 90]]  # type: ignore[union-attr]
+
+
+def test_black_points_are_without_colours(tmp_path: Path) -> None:
+    capture = Capture("made", tmp_path, tmp_path, (), None)
+    for value, expected in ((0, 128), (7, 7)):
+        _write(tmp_path / "a.ply", {name: ("u1", [value]) for name in ("red", "green", "blue")})
+        _, colors, notes = initial_cloud(capture, "a.ply")
+        assert colors.unique().tolist() == [expected] and (GREY_POINTS in notes) == (value == 0)
 
 
 def test_axes_in_capitals_and_lists(tmp_path: Path) -> None:

@@ -32,6 +32,11 @@ def test_list_files_in_all_notations(train: str, test: str, tmp_path: Path) -> N
     assert split.notes == ("split: train.txt and test.txt",)
 
 
+def test_lists_in_the_unicode_of_windows(tmp_path: Path) -> None:
+    (tmp_path / "test.txt").write_text("b\r\nsub/d.png\r\n", encoding="utf-16")
+    assert split_frames(NAMES, tmp_path).test == (1, 3)
+
+
 def test_a_missing_list_is_completed(tmp_path: Path) -> None:
     split = split_frames(NAMES, _lists(tmp_path, None, "b"))
     assert (split.train, split.test) == ((0, 2, 3, 4), (1,))

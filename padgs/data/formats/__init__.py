@@ -5,7 +5,7 @@ from pathlib import Path
 
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.colmap import find_model
-from padgs.data.formats.metashape import find_xml
+from padgs.data.formats.metashape import find_xml, xml_files
 
 E57 = "*.[eE]57"
 # Files that together identify a format, most specific first: folders of published data sets also hold files of general
@@ -27,6 +27,12 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("navvis", ("pano/pano-poses.csv",)),
     ("e57", (E57,)),
 )
+NEARLY = {  # names of files that hold a data set in another form, and what to do with them
+    ("sfm_data*",): "make sfm_data.json of it with openMVG_main_ConvertSfM_DataFormat -V -I -E -S",
+    ("reconstruction*.json", "transforms*.json"): "call it reconstruction.json or transforms.json",
+    ("*.psx", "*.psz"): "open it in Metashape, and export cameras.xml (File > Export > Export Cameras)",
+    ("*.zip", "*.tar*", "*.tgz", "*.7z", "*.rar"): "unpack it, and give its folder",
+}
 SEARCHED = 50  # names in a folder without a format, which are tried instead of it
 # Files that may be given instead of their folder.
 ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json", "*.xml", "pano-poses.csv", E57)
@@ -36,10 +42,15 @@ def detect(path: Path) -> tuple[str, str]:
     """Detect the format of a data set; return its name and the reason. A DataError lists what identifies a format."""
     found = _found(path)
     if not found:
-        children = sorted(path.iterdir()) if path.is_dir() else []
-        inside = listed([child.name for child in children]) if path.is_dir() else "a file"
-        below = [str(child) for child in children[:SEARCHED] if child.is_dir() and _found(child)]
-        hint = f", but {listed(below)} {'has: give that' if len(below) == 1 else 'have: give one'}" if below else ""
+        names = [child.name for child in sorted(path.iterdir())] if path.is_dir() else []
+        inside = listed(names) if path.is_dir() else "a file"
+        above = [str(parent) for parent in list(path.absolute().parents)[2::-1] if _found(parent)][:1]
+        folders = [child for level in ("*", "*/*") for child in sorted(path.glob(level))[:SEARCHED] if child.is_dir()]
+        near = above or [str(folder) for folder in folders if _found(folder)] or [str(xml) for xml in xml_files(path)]
+        hint = f", but {listed(near)} {'has: give that' if len(near) == 1 else 'have: give one'}" if near else ""
+        for ends, way in NEARLY.items():
+            others = [name for name in [path.name, *names] if any(fnmatch(name.lower(), end) for end in ends)]
+            hint += f", but {others[0]}: {way}" if others else ""
         raise DataError(
             f"{path} has no known format{hint}; it holds {inside or 'nothing'}. Known: a COLMAP model (sparse/0), "
             "transforms.json, sfm_data.json, reconstruction.json, cameras.xml (Metashape), pano-poses.csv (NavVis), "

@@ -15,7 +15,7 @@ from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, listed
 from padgs.data.cloud import first_ply
 from padgs.data.formats import colmap_files as model_files
-from padgs.data.formats.colmap_lens import lens_of
+from padgs.data.formats.colmap_lens import lens_of, pycolmap_module
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.splits import check_name
 
@@ -114,6 +114,10 @@ def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: 
     where = f"{name} in {model}"
     if camera is None:
         raise DataError(f"{where} has a camera that the model does not hold; export the whole model")
+    is_named = camera.model not in model_files.PANORAMIC and not camera.model.startswith("type ")
+    if is_named and camera.model not in pycolmap_module().CameraModelId.__members__:
+        rule = "COLMAP has no such model; panoramas have EQUIRECTANGULAR: write that, if it is one"
+        raise DataError(f"{where} has a {camera.model} camera; {rule}")
     lens = None if camera.model in model_files.PANORAMIC else partial(lens_of, camera, where)
     return Frame(name, folder / name, pose_of(image, where), camera.width, camera.height, lens=lens)
 

@@ -70,6 +70,7 @@ def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
         for number, line in _lines(file):
             words, kinds = line.split(), (int, str, int, int)
             key, model, width, height = _fields(file, number, words, kinds, "ID MODEL WIDTH HEIGHT")
+            model = model.upper()
             params = words[4:] if model not in PANORAMIC else []
             if model == "SPHERE":
                 _, *center = _fields(file, number, words[4:], (float,) * 3, "F CX CY after ID SPHERE WIDTH HEIGHT")
@@ -156,7 +157,7 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines of a text file that are neither empty nor comments, with their numbers."""
     errors = "surrogateescape" if file.stem == "images" else "replace"  # names are refused later, with advice
     for number, line in enumerate(read_lines(file, errors), 1):
-        if line.strip() and not line.startswith("#"):
+        if line.strip() and not line.strip().startswith("#"):
             yield number, line.strip()
 
 

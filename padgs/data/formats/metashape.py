@@ -27,8 +27,13 @@ def find_xml(path: Path) -> Path | None:
     """Return the file of cameras: `path` itself, cameras.xml in it, or the only XML file with a chunk in it."""
     if path.is_file() or (path / "cameras.xml").exists():
         return path if path.is_file() else path / "cameras.xml"
-    found = [file for file in files_with(path, ".xml") if b"<chunk" in file.read_bytes()[:4096]]
+    found = xml_files(path)
     return found[0] if len(found) == 1 else None
+
+
+def xml_files(path: Path) -> list[Path]:
+    """Return the XML files in a folder that have a chunk."""
+    return [file for file in files_with(path, ".xml") if b"<chunk" in file.read_bytes()[:4096]]
 
 
 def read(path: Path, options: DataOptions) -> Capture:
@@ -115,7 +120,7 @@ def _sizes(chunk: XML.Element, used: set[str], file: Path) -> dict[str, tuple[in
         if key not in sensors:
             raise DataError(f"{file}: cameras use <sensor id={key!r}>, which is not in <sensors>; export them again")
         where, kind = f"<sensor id={key!r} label={sensors[key].get('label')!r}>", sensors[key].get("type")
-        if kind != "spherical":
+        if (kind or "").lower() != "spherical":
             raise DataError(
                 f"{file}: {where} has the type {kind!r}; only 'spherical' sensors (panoramas) can be used: disable the "
                 "cameras of the other sensors in Metashape, or set Tools > Camera Calibration > Type to Spherical"

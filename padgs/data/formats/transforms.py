@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 
-from padgs.data.capture import Capture, DataError, DataOptions, Frame
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, first_of
 from padgs.data.cloud import first_ply, read_ply
 from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
@@ -15,13 +15,13 @@ from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.splits import is_inside
 
 FILE = "transforms.json"
-SIDES = {"train": "transforms_train.json", "test": "transforms_test.json"}
+SIDES = {"train": ("transforms_train.json",), "test": ("transforms_test.json", "transforms_val.json")}
 MODELS = ("EQUIRECTANGULAR", "SPHERICAL")
 _PLY = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pcd.ply", "scene.ply")
 
 
 def read(path: Path, options: DataOptions) -> Capture:
-    """Read `transforms.json`, or the pair of files for train and test.
+    """Read `transforms.json`, or the pair of files for train and test (else val).
 
     A DataError: another camera model, an invalid pose, or a path outside the folder.
     """
@@ -30,27 +30,29 @@ def read(path: Path, options: DataOptions) -> Capture:
     if file.exists():
         metas = {"": read_json(file)}
     else:
-        metas = {side: read_json(folder / name) for side, name in SIDES.items() if (folder / name).is_file()}
+        metas = {side: read_json(part) for side, names in SIDES.items() if (part := first_of(folder, names))}
     if not metas:
-        raise DataError(f"{folder} holds neither {FILE} nor {' and '.join(SIDES.values())}")
+        raise DataError(f"{folder} holds neither {FILE} nor {SIDES['train'][0]} and {SIDES['test'][0]}")
     root = folder if options.images is None else folder / options.images
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side, meta in metas.items():
         part = [_frame(meta, frame, root) for frame in meta["frames"].entries()]
         frames += part
-        if side:
+        if len(metas) > 1:
             split[side] = tuple(frame.name for frame in part)
     first = next(iter(metas.values()))
     for side in SIDES:
-        if "" in metas and (names := first.get(f"{side}_filenames")):
+        if "" in metas and (names := first.get(f"{side}_filenames")) and names.entries():
             split[side] = tuple(_name(name) for name in names.entries())
     prefix = _shared_folder([frame.name for frame in frames])
     if prefix:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
     named, mask = first.get("ply_file_path"), first.get("mask")
-    cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
+    cloud = None
+    if options.points == "auto":  # else a missing or damaged file does not matter
+        cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
     meant = mask.text() if mask else "auto"  # as `padgs split` states it
     return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant)
 
@@ -67,7 +69,7 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
     name = _name(frame["file_path"])
     stated = frame.get("camera_model") or meta.get("camera_model")
     model = stated and stated.text()
-    if model not in MODELS:
+    if model is None or model.upper() not in MODELS:
         rule = "only EQUIRECTANGULAR panoramas can be used (set camera_model if these are panoramas)"
         raise DataError(f"{meta.where}: {name} has camera_model {model!r}; {rule}")
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]

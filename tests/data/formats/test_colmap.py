@@ -106,6 +106,23 @@ def test_names_of_the_panoramic_camera(camera: str, world: World, tmp_path: Path
         load(tmp_path)
 
 
+def test_camera_models_that_colmap_does_not_have(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    _rewrite(tmp_path, "cameras.txt", lambda text: "1 Equirectangular 64 32 64 32\n")
+    assert read(tmp_path).frames[0].lens is None
+    _rewrite(tmp_path, "cameras.txt", lambda text: "1 OPENCV_SPHERICAL 64 32\n")
+    with pytest.raises(DataError, match=r"pano_00.png in .* has a OPENCV_SPHERICAL camera; .*EQUIRECTANGULAR: write"):
+        load(tmp_path)
+
+
+def test_texts_in_the_unicode_of_windows_and_indented_comments(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    before = load(tmp_path)
+    for file in (tmp_path / "sparse/0").glob("*.txt"):
+        file.write_text(f"  # made elsewhere\n{file.read_text()}", encoding="utf-16")
+    assert load(tmp_path).fingerprint == before.fingerprint
+
+
 def test_binary_sphere_cameras(world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
     file = tmp_path / "sparse/0/cameras.bin"

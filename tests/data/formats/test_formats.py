@@ -100,6 +100,34 @@ def test_pairs_of_transforms_files(world: World, tmp_path: Path) -> None:
     assert [view.name for view in scene.test] == list(world.test) and len(scene.points) == len(world.points)
 
 
+def test_transforms_files_for_validation_and_alone(world: World, tmp_path: Path) -> None:
+    whole = _written(world, tmp_path)
+    scene = tmp_path / "scene"
+    (scene / "transforms.json").unlink()
+    halves = {"train": whole["frames"][:4], "val": whole["frames"][4:]}
+    for side, frames in halves.items():
+        (scene / f"transforms_{side}.json").write_text(json.dumps({**whole, "frames": frames}))
+    names = [Path(frame["file_path"]).stem for frame in whole["frames"]]
+    assert [view.name for view in load(scene).test] == names[4:]
+    (scene / "transforms_train.json").write_text(json.dumps({**whole, "frames": whole["frames"]}))
+    (scene / "transforms_val.json").unlink()
+    for side in ("train", "test"):
+        (scene / f"{side}.txt").unlink(missing_ok=True)
+    assert [view.name for view in load(scene).test] == names[:1]
+
+
+def test_transforms_without_test_names_and_with_models_in_small_letters(world: World, tmp_path: Path) -> None:
+    whole = _written(world, tmp_path)
+    paths = [frame["file_path"] for frame in whole["frames"]]
+    lists = {"train_filenames": paths[:4], "val_filenames": paths[4:], "test_filenames": []}
+    changed = {**whole, **lists, "camera_model": "equirectangular", "ply_file_path": "absent.ply"}
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps(changed))
+    scene = load(tmp_path / "scene", points="random")
+    assert [view.name for view in scene.test] == [Path(path).stem for path in paths[4:]]
+    with pytest.raises(DataError, match=r"absent.ply does not exist; set data.points to a .* file, or to random"):
+        load(tmp_path / "scene")
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_byte_order_marks(encoding: str, world: World, tmp_path: Path) -> None:
     _written(world, tmp_path)
