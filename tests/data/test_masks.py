@@ -34,21 +34,21 @@ def test_row_weights_scale_with_the_height() -> None:
     assert half.sum() == 479.5
 
 
-def test_one_mask_for_the_scene(folder: Path) -> None:
-    _mask(folder / "mask.png")
+@pytest.mark.parametrize("name", ["mask.png", "mask.tif", "mask.jpeg", "mask.webp"])
+def test_one_mask_for_the_scene(name: str, folder: Path) -> None:
+    _mask(folder / name)
     scene = load(folder, width=32)
     for view in (*scene.train, *scene.test):
         mask = view.mask()
         assert mask is not None and mask.shape == (16, 32)
         assert mask[:12].eq(1).all() and mask[12:].eq(0).all()
-    assert "mask: mask.png for every view" in scene.notes
+    assert f"mask: {name} for every view" in scene.notes
     assert load(folder, mask="none").train[0].mask() is None
 
 
 @pytest.mark.parametrize(
     "file",
-    [f"mask{extension}" for extension in (".tif", ".jpeg", ".webp")]
-    + [f"{folder}/{name}" for folder in ("masks", "mask") for name in ("pano_00.png", "pano_00.png.png", "PANO_00.BMP")]
+    [f"{folder}/{name}" for folder in ("masks", "mask") for name in ("pano_00.png", "pano_00.png.png", "PANO_00.BMP")]
     + [
         "masks/pano_00_mask.jpg",
         "images/pano_00_mask.png",

@@ -93,6 +93,6 @@ def test_too_few_views_and_no_lists(tmp_path: Path) -> None:
 
 
 def test_list_files_must_be_utf8(tmp_path: Path) -> None:
-    (tmp_path / "train.txt").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "train.txt").write_bytes(b"\x81\xfe\x00\xff")
     with pytest.raises(DataError, match="train.txt cannot be read as UTF-8 text"):
         read_list(tmp_path / "train.txt")

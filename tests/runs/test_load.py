@@ -87,7 +87,8 @@ def test_finer_pixels_have_fewer_samples_as_close_together(tmp_path_factory):
 
 
 def test_low_passes_keep_their_angle_where_a_short_run_had_one_sample(tmp_path_factory):
-    overrides = "method=padgs_plus", "render.low_pass_kind=angular"  # which the 3D filter does not replace
+    overrides = ["method=padgs_plus", "method.supersampling_share=1000.0"]
+    overrides += ["render.low_pass_kind=angular"]  # which the 3D filter does not replace
     run = padgs.load_run(tiny_run(tmp_path_factory, *overrides), device="cpu")
     assert (run.config.render.supersampling, run.method.model.supersampling) == (2, 1)
     finer = run.through(Panorama(4 * run.scene.train[0].width, 4 * run.scene.train[0].height))
