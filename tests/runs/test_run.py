@@ -369,7 +369,7 @@ def test_time_running_out_is_a_status_and_the_model_is_scored(config):
 def test_a_run_folder_that_cannot_be_made_is_a_clear_error(config, tmp_path):
     (tmp_path / "file").write_text("")
     blocked = replace(config, run=replace(config.run, folder=str(tmp_path / "file")))
-    with pytest.raises(RunFolderError, match="cannot write run folder .*set run.folder"):
+    with pytest.raises(RunFolderError, match="cannot write run folder .*name another place .run.folder"):
         run(blocked)
 
 
