@@ -77,6 +77,14 @@ def test_the_long_runs_of_padgs_plus(root):
         assert f"{leads[0]:.1f} and {leads[1]:.1f} dB" in " ".join((root / page).read_text().split()), page
 
 
+def test_the_table_of_opacity_modulation(root, after_a_minute):
+    lines = (root / "docs/notes/padgs_paper.md").read_text().splitlines()
+    rows = {row[0]: row[1:] for row in map(cells, lines) if row}
+    for title, column in (("WS-PSNR", WS_PSNR), ("PSNR", "PSNR ↑"), ("WS-PSNR of the poles", POLE)):
+        pairs = ([after_a_minute(s, method, column) for method in ("PaD-GS, unmodulated", "PaD-GS")] for s in SCENES)
+        assert rows[title] == [" → ".join(f"{value:.2f}" for value in pair) for pair in pairs], title
+
+
 def test_the_answers_of_the_readme(root, after_a_minute):
     of, scenes = after_a_minute, list(SCENES)
     never = scenes[:3]
@@ -95,6 +103,7 @@ def test_the_answers_of_the_readme(root, after_a_minute):
         f"and {min(leads[:3]):.1f} dB or more above every published method",
         f"has {between(gains, '.1f')} dB more WS-PSNR after that minute on each of six scenes",
         f"{between([gain for gain in at_poles if gain > 0], '.1f')} dB more at the poles of five",
+        f"at those of the court modulation gains {-at_poles[2]:.1f} dB",
         f"{between(counts[0], ',.0f')} at 512×256 with padgs+",
         f"SPaGS ends with {between(counts[1], ',.0f')} and {between(less, '.1f')} dB less",
         f"OmniGS, OP43DGS and ODGS with {between(others, ',.0f')}",
