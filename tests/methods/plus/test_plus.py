@@ -328,7 +328,7 @@ def test_short_runs_have_several_samples_where_these_change_much_of_the_error(sh
 
 @pytest.mark.parametrize(("share", "gains"), [(0.8, True), (1.25, False)])
 def test_the_change_by_samples_is_relative_to_the_error(share, gains):
-    """Where the images are what several samples give, the change is the error."""
+    """Compare change and error where the images are what several samples give, so that both are the same."""
     scene, method = tiny_scene(), PlusMethod(replace(OPTIONS, supersampling_share=share))
     several = replace(PlusMethod.RENDER, supersampling=2).options(scene.scale)
 
