@@ -83,7 +83,8 @@ class Monitor:
 
     It reads the loss at every iteration (on a GPU when it has been read), and all else when gradients and parameters
     are checked. A sign must last before it ends a run: healthy runs show each sign for a while, as after a reset of
-    opacities. Too many Gaussians end a run at once, and so does a high loss at the last step. `state` is JSON.
+    opacities. Too many Gaussians end a run at once, and so does a loss at the last step that rose and has not fallen
+    since. `state` is JSON.
     """
 
     def __init__(self, iterations: int, count: int, pixels: int, *, active: bool = True) -> None:
@@ -93,14 +94,14 @@ class Monitor:
         self._step: int | None = None  # schedule step of the iteration; None if both are the same
         self.state: dict[str, Any] = {
             **{"start": count, "sum": 0.0, "weight": 0.0, "seen": 0, "best": None},
-            **{"since": {}, "highest": 0.0, "first": FIRST, "halvings": None},
+            **{"since": {}, "highest": 0.0, "peak": 0.0, "first": FIRST, "halvings": None},
         }
 
     def begin(self, step: int, halvings: int, iteration: int) -> None:
         """Begin an iteration; losses are not compared with those of views that were halved more or less often."""
         state, self._step = self.state, step
         if state["halvings"] is not None and state["halvings"] != halvings:
-            state |= {"sum": 0.0, "weight": 0.0, "best": None, "highest": 0.0, "first": iteration + FIRST}
+            state |= {"sum": 0.0, "weight": 0.0, "best": None, "highest": 0.0, "peak": 0.0, "first": iteration + FIRST}
             state["since"].pop("diverged", None)
         state["halvings"] = halvings
 
@@ -116,13 +117,14 @@ class Monitor:
             state["best"] = average if state["best"] is None else min(average, state["best"])
         best = state["best"]
         high = best is not None and average > WORSE * best
-        highest = max(average, state["highest"]) if high else 0.0
+        highest, peak = (max(average, state[key]) if high else 0.0 for key in ("highest", "peak"))
         if average < FALLING * highest:
             state["since"].pop("diverged", None)
             highest = average
-        state["highest"] = highest
+        state["highest"], state["peak"] = highest, peak
         ends = (iteration if self._step is None else self._step) >= self._iterations
-        if since := self._lasting("diverged", high, iteration, least=0 if ends else MIN_LASTING):
+        recovers = average < FALLING * peak  # as after pruning late in a short run
+        if since := self._lasting("diverged", high, iteration, least=0 if ends and not recovers else MIN_LASTING):
             self._fail(
                 "diverged",
                 f"the loss at iteration {iteration} is {average:.4g}, and since iteration {since} more than {WORSE} "

@@ -95,8 +95,8 @@ def leave_one_out_on_gpu(request: Request, target: torch.Tensor, weight: torch.T
 
 
 if ON_GPU:
-    BACKENDS["cuda"] = "cuda_engine:rasterize_on_gpu"
-    SCORERS["cuda"] = "cuda_engine:leave_one_out_on_gpu"
+    BACKENDS["cuda"] = f"{__name__}:rasterize_on_gpu"
+    SCORERS["cuda"] = f"{__name__}:leave_one_out_on_gpu"
 else:
     cuda.library = emulated_library
 

@@ -11,6 +11,7 @@ from collections import Counter
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -22,8 +23,10 @@ INDEXING = ("index", "index_put", "index_put_", "_index_put_impl_")  # take CPU 
 COPYING = ("copy_", "_to_copy")
 READING = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "_unique2", "masked_select")
 
+if torch.cuda.is_available():  # torch takes one kind of accelerator, and could no longer differentiate on the GPU
+    pytest.skip("a GPU cannot be pretended beside a real one", allow_module_level=True)
 _setup_privateuseone_for_python_backend("pretended")
-# Torch now takes it for this process's accelerator; `torch.utils.checkpoint` asks it, wherever the tensors are.
+# `torch.utils.checkpoint` asks it, wherever the tensors are.
 torch.get_device_module("pretended").get_amp_supported_dtype = lambda: [torch.float16]
 GPU = torch.device("pretended", 0)
 

@@ -88,6 +88,14 @@ def test_a_short_run_that_ends_while_its_loss_is_high_has_diverged():
         calm.loss(0.2 if iteration != 58 else 0.9, iteration)
 
 
+@pytest.mark.parametrize("every", [1, 10])
+def test_a_short_run_that_recovers_from_late_pruning_has_not(every: int):
+    watch = Monitor(300, count=1000, pixels=2000)
+    for iteration in range(every, 301, every):
+        watch.loss(0.0145 if iteration < 200 else 0.028 + 0.08 * 0.9 ** (iteration - 200), iteration)
+    assert watch.state["sum"] > 1.5 * watch.state["best"], "it has not come back to what it was"
+
+
 def test_losses_may_be_seen_now_and_then():
     rarely, always = monitor(), monitor()
     for iteration in range(1, 401):

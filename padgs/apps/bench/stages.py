@@ -7,6 +7,7 @@ iteration. `padgs.training.loop` has the outer stages; native calls are inner on
 import copy
 import re
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
@@ -121,10 +122,12 @@ def device_stages(work: Workload, rounds: int, device: torch.device) -> dict[str
     for _ in range(WARM_UP):
         next(records)
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device.type == "cuda" else [])]
-    with profile(activities=activities) as profiler:
-        for _ in range(rounds):
-            next(records)
-        clock.synchronise(device)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "(Warning: )?Profiler clears events")  # there is one cycle
+        with profile(activities=activities) as profiler:
+            for _ in range(rounds):
+                next(records)
+            clock.synchronise(device)
     found: dict[str, dict[str, float]] = {}
     for event in profiler.key_averages():
         if event.device_type.name.lower() == device.type and not getattr(event, "is_user_annotation", False):
@@ -138,7 +141,10 @@ def device_stages(work: Workload, rounds: int, device: torch.device) -> dict[str
 def kernel_name(signature: str) -> str:
     """Return a kernel's name without return type, template arguments and parameters.
 
-    >>> kernel_name("void padgs::blend_kernel<16, true>(Arguments)"), kernel_name("Memcpy HtoD (Pinned -> Device)")
-    ('padgs::blend_kernel', 'Memcpy HtoD')
+    >>> kernel_name("void padgs::(anonymous namespace)::blend_kernel<16, true>(Arguments)")
+    'padgs::blend_kernel'
+    >>> kernel_name("Memcpy HtoD (Pinned -> Device)")
+    'Memcpy HtoD'
     """
-    return re.split(r"[<(]", signature.removeprefix("void "))[0].strip() or signature
+    name = signature.removeprefix("void ").replace("(anonymous namespace)::", "")
+    return re.split(r"[<(]", name)[0].strip() or signature

@@ -20,7 +20,7 @@ from padgs.native.cuda import DeviceDecodeArguments, DeviceDecodeGradientArgumen
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each network per Gaussian
 SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacities, colors; 0 = a scalar
 ALIGNMENT = 8  # rows of inputs are padded with zeros to a multiple: cuBLAS is slower for unaligned rows
-CHUNK = 4096  # anchors in one part of a product that sums over anchors
+CHUNK = 512  # anchors in one part of a product that sums over anchors
 
 
 class _DecodeOnCPU(torch.autograd.Function):

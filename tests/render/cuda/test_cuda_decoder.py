@@ -69,7 +69,7 @@ def test_decoding_with_capacity_pads_with_zeros(rows: str, generator: torch.Gene
 def test_gaussians_beyond_capacity_have_no_gradient(generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
     count = len(on_gpu(decoder.weights(), SeenAnchors(**tensors))[0])
-    upstream, found = torch.randn(count - 30, 3, generator=generator), []
+    upstream, found = torch.randn(count - 30, 3, generator=generator).to(DEVICE), []
     leaves = [tensors[name].requires_grad_() for name in LEARNED]
     for capacity in (count - 30, count):
         gaussians = on_gpu(decoder.weights(), SeenAnchors(**tensors), capacity)[0]

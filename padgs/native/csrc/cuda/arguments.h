@@ -100,7 +100,7 @@ struct DeviceDecodeArguments {
 struct DeviceDecodeGradientArguments {
   DecodeGradientArguments gradient;                 // features_out and weights_out are not used
   int64_t room;                                     // there is no gradient of Gaussians behind it
-  float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K] or null: dL by the networks' outputs
+  float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K] dL by the networks' outputs
 };
 
 struct DeviceSplatArguments {
