@@ -1,5 +1,6 @@
 """`padgs report`: read finished runs, make tables, charts and the page, write them down."""
 
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -74,8 +75,9 @@ def report(
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     show(f"{len(found)} results, {len(broken)} left out; see {target}", sys.stderr)
-    page = f"open {target / 'report.html'} in a browser" if what in ("html", ALL) else f"padgs report html {source}"
-    show(f"next: {page}", sys.stderr)
+    command = shlex.join(["padgs", "report", "html", runs, *(["--out", out] if out else [])])
+    opened = f"open {target / 'report.html'} in a browser"
+    show(f"next: {opened if what in ('html', ALL) else command}", sys.stderr)
     for warning in dict.fromkeys(run_set.warnings):
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):

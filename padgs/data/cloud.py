@@ -126,14 +126,12 @@ def joined(clouds: Sequence[Cloud]) -> Cloud:
 def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:
     """Return the initial points [P, 3] float64, their colours [P, 3] uint8, and notes; a DataError for unusable points.
 
-    `source` is `data.points`: auto (the format's own, else random), random, or a file for `read_cloud`.
+    `source` is `data.points`: random, else the points of the capture, or random ones if it has none.
     """
     notes: tuple[str, ...] = ()
-    cloud, where = capture.cloud, f"the {capture.format} model in {capture.folder}"
-    if source not in ("auto", "random"):
-        path = capture.folder / source
-        (cloud, notes), where = read_cloud(path), str(path)
-    elif source == "random" or cloud is None:
+    cloud, model = capture.cloud, f"the {capture.format} model in {capture.folder}"
+    where = model if source in ("auto", "random") else str(capture.folder / source)  # read with the capture
+    if source == "random" or cloud is None:
         cloud = random_cloud(torch.stack([frame.cam_from_world for frame in capture.frames]))
         why = "data.points=random" if source == "random" else f"{capture.format} holds none; set data.points to a file"
         notes = (f"points: {RANDOM_POINTS} random points around the cameras ({why})",)

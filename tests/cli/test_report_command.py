@@ -29,7 +29,7 @@ def test_a_report_is_written_and_printed(runs, tmp_path):
     written = {path.name: path.read_text() for path in (tmp_path / "out").iterdir()}
     assert written.keys() == {"table3.md", "table3.tex", "table3.csv"}
     assert written["table3.md"] in done.output
-    assert "next: padgs report html" in done.output
+    assert f"next: padgs report html {runs} --out {tmp_path / 'out'}" in done.output
 
 
 def test_a_folder_without_results_is_refused_and_left_alone(runs, tmp_path):

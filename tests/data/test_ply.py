@@ -125,10 +125,9 @@ def test_colours_of_gaussians_and_packed_colours(tmp_path: Path) -> None:
 
 
 def test_black_points_are_without_colours(tmp_path: Path) -> None:
-    capture = Capture("made", tmp_path, tmp_path, (), None)
     for value, expected in ((0, 128), (7, 7)):
-        _write(tmp_path / "a.ply", {name: ("u1", [value]) for name in ("red", "green", "blue")})
-        _, colors, notes = initial_cloud(capture, "a.ply")
+        cloud = read_ply(_write(tmp_path / "a.ply", {name: ("u1", [value]) for name in ("red", "green", "blue")}))
+        _, colors, notes = initial_cloud(Capture("made", tmp_path, tmp_path, (), cloud), "auto")
         assert colors.unique().tolist() == [expected] and (GREY_POINTS in notes) == (value == 0)
 
 

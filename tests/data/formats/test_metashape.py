@@ -45,6 +45,15 @@ def test_the_frame_of_points_is_decided_by_their_colours(cloud: str, world: Worl
     torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
 
 
+def test_the_frame_of_named_points_is_decided_too(world: World, tmp_path: Path) -> None:
+    write_metashape(world, tmp_path, cloud="world")
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "dense.ply").rename(tmp_path / "scans/a.ply")
+    scene = load(tmp_path, points="scans/a.ply")
+    assert any("points in the frame of the world: colours agree by 0.9" in note for note in scene.notes)
+    torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
+
+
 def test_cameras_without_use_are_noted(folder: Path) -> None:
     notes = " ".join(read(folder).notes)
     assert "1 cameras are disabled in Metashape" in notes and "1 cameras have no <transform> (not aligned)" in notes
