@@ -18,6 +18,7 @@ from padgs.render.contract import LazyCounters, Removals
 IDENTITY = torch.eye(4)
 MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
 HEADROOM = 1.3  # capacity for an image, as a multiple of the instances of the last image of this size
+DECAY = 0.99  # of a capacity with each image that needs less; the faces of a cubemap need different ones in turn
 _capacities: dict[tuple, int] = {}  # device, width and height -> capacity for the next image
 FLOATS = functools.partial(torch.empty, dtype=torch.float32)
 INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
@@ -162,7 +163,7 @@ class _Image(NativeImage):
                 break
             capacity = 0
         instances = self._projected.instances
-        wanted = max(int(HEADROOM * instances) + 1, capacity * 15 // 16)
+        wanted = max(int(HEADROOM * instances) + 1, int(DECAY * capacity))
         _capacities[key] = min(wanted, limit) if instances <= limit else 0  # 0: strips need the exact number
         known = {"gaussians": inputs.count, "visible": self._projected.visible, "instances": instances}
         self.counters = LazyCounters(known, ("evaluated", "contributing"), pairs.tolist)
@@ -174,7 +175,7 @@ class _Image(NativeImage):
         totals = torch.zeros(len(projected.order), GRADIENT_SUMS, dtype=torch.float32, device=device)
         core_gradients = FLOATS(*pixels[2].shape, core_size, 2, device=device) if core_size else None
         for strip in projected.strips():
-            sums = FLOATS(strip.instances, GRADIENT_SUMS, device=device)
+            sums = FLOATS(min(strip.instances, projected.instances), GRADIENT_SUMS, device=device)
             arguments = cuda.BlendGradientInputs(
                 self._blend_inputs(strip, background, pixels, None),
                 *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),

@@ -200,6 +200,16 @@ def test_capacity_of_the_last_image_changes_nothing(
     assert {*cuda_backend._capacities.values()} == {count}  # the next has as much as may be
 
 
+def test_faces_of_a_cubemap_share_a_capacity_for_the_largest(generator, monkeypatch: pytest.MonkeyPatch):
+    options, many = RenderOptions("ray"), crowd(200, generator)
+    for _ in range(2):
+        bins = recorded(monkeypatch, "padgs_cuda_bin", lambda arguments: arguments.sort.count)
+        drawn(many, (72, 36), options)
+        for _ in range(5):
+            drawn(many.first(10), (72, 36), options)
+    assert len(bins) == 6, "no face is drawn twice"
+
+
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
 def test_counters_equal_those_of_the_cpu(lens: str, blending: str, generator: torch.Generator):
