@@ -340,7 +340,7 @@ def _joined(runs: Sequence[LoadedRun], numbers: Sequence[int], regions: Mapping[
         means = state.tensors["splats/means"].double().cpu() + run.scene.origin.cpu()
         kept = torch.from_numpy(owner[tree.query(means.numpy())[1]] == number)
         rows = {n: t[kept] for n, t in state.tensors.items() if n.startswith(("splats/", "statistics/", "filter/"))}
-        rows["splats/means"] = (means[kept] - scene.origin.cpu()).float()
+        rows["splats/means"] = (means[kept] - scene.origin.cpu()).to(state.tensors["splats/means"])
         parts.append(rows)
     stored = runs[0].method.state()
     model = stored.of_model()
