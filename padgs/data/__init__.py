@@ -10,7 +10,7 @@ from pathlib import Path
 from padgs.checks import lookup
 from padgs.data.assemble import assemble, found_images
 from padgs.data.capture import Capture, DataError, DataOptions
-from padgs.data.cloud import read_cloud
+from padgs.data.cloud import NO_FILE, read_cloud
 from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
@@ -84,7 +84,7 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
     capture = replace(capture, mask=mask, notes=(*notes, *capture.notes))
-    if options.points_file is not None:  # before its frame is chosen; tracks belong to the capture's own points
-        cloud, notes = read_cloud(capture.folder / options.points_file)
+    if options.points not in NO_FILE:  # before its frame is chosen; tracks belong to the capture's own points
+        cloud, notes = read_cloud(capture.folder / options.points)
         capture = replace(capture, cloud=cloud, tracks=None, notes=(*capture.notes, *notes))
     return best_reading(found_images(capture))

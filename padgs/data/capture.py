@@ -188,11 +188,6 @@ class DataSettings:
             if getattr(self, name) < 0:
                 raise DataError(f"data.{name} is {getattr(self, name)}; it must be 0, which switches it off, or more")
 
-    @property
-    def points_file(self) -> str | None:
-        """The file of `points`, if it is one."""
-        return None if self.points in ("auto", "random") else self.points
-
 
 @dataclass(frozen=True)
 class DataOptions(DataSettings):

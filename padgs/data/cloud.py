@@ -18,6 +18,7 @@ CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, afte
 PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
 SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 1/2 + SH_C0 f_dc
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0
+NO_FILE = ("auto", "random")  # values of `data.points` that name no file
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
 GREY, GREY_POINTS = 128, "points: the cloud has no colours; grey is used"
@@ -130,7 +131,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
     """
     notes: tuple[str, ...] = ()
     cloud, model = capture.cloud, f"the {capture.format} model in {capture.folder}"
-    where = model if source in ("auto", "random") else str(capture.folder / source)  # read with the capture
+    where = model if source in NO_FILE else str(capture.folder / source)  # read with the capture
     if source == "random" or cloud is None:
         cloud = random_cloud(torch.stack([frame.cam_from_world for frame in capture.frames]))
         why = "data.points=random" if source == "random" else f"{capture.format} holds none; set data.points to a file"

@@ -81,6 +81,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     if outer is None and all(matrix.equal(same) for matrix in components.values()):
         notes.append(f"{file.name} has no <transform> of a chunk or component: lengths are in the chunk's own unit")
     plys = [file.parent / name for name in _PLY if (file.parent / name).is_file()] or files_with(file.parent, ".ply")
+    plys = plys if options.points == "auto" else []  # else a missing or damaged file does not matter
     if len(plys) > 1:
         notes.append(f"points: {plys[0].name}, not {listed(ply.name for ply in plys[1:])}; set data.points to choose")
     # In which frame a cloud was exported is not stated in its file.
