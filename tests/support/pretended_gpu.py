@@ -23,17 +23,19 @@ INDEXING = ("index", "index_put", "index_put_", "_index_put_impl_")  # take CPU 
 COPYING = ("copy_", "_to_copy")
 READING = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "_unique2", "masked_select")
 
-if torch.cuda.is_available():  # torch takes one kind of accelerator, and could no longer differentiate on the GPU
-    pytest.skip("a GPU cannot be pretended beside a real one", allow_module_level=True)
-_setup_privateuseone_for_python_backend("pretended")
-# `torch.utils.checkpoint` asks it, wherever the tensors are.
-torch.get_device_module("pretended").get_amp_supported_dtype = lambda: [torch.float16]
-GPU = torch.device("pretended", 0)
+IS_REAL = torch.cuda.is_available()  # torch takes one kind of accelerator, and could no longer differentiate on the GPU
+if not IS_REAL:
+    _setup_privateuseone_for_python_backend("pretended")
+    # `torch.utils.checkpoint` asks it, wherever the tensors are.
+    torch.get_device_module("pretended").get_amp_supported_dtype = lambda: [torch.float16]
+GPU = torch.device("cuda" if IS_REAL else "pretended", 0)
 
 
 @contextmanager
 def pretended_gpu():
-    """Provide a device `GPU`; yield the Counter of operations that made the host wait for it."""
+    """Provide a device `GPU`; yield the Counter of operations that made the host wait. Skips beside a real GPU."""
+    if IS_REAL:
+        pytest.skip("a GPU cannot be pretended beside a real one")
     waits: Counter[str] = Counter()
     with _Operations(waits), _Functions(waits):
         yield waits
