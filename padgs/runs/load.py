@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from omegaconf import OmegaConf
 from yaml import YAMLError
 
@@ -153,8 +154,9 @@ class LoadedRun:
 def load_run(folder: str | Path, *, data_path: str | Path | None = None, device: str = "auto") -> LoadedRun:
     """Load a run folder: `config.yaml` and `checkpoint/`, as `padgs-run` writes them.
 
-    `data_path` is the folder of the data set if it has moved, `device` is auto, cpu or cuda. A RunFolderError says that
-    it is no run folder; CheckpointError, ResultError and ConfigError name a file that is damaged or of another version.
+    `data_path` is the folder of the data set if it has moved. `device` is auto, cpu or cuda; a run whose native
+    backend is not for it is rendered by that of the device. A RunFolderError says that it is no run folder;
+    CheckpointError, ResultError and ConfigError name a file that is damaged or of another version.
     """
     store = RunStore(Path(folder))
     settings = store.path / results.CONFIG_NAME
@@ -168,6 +170,8 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         run = {"configuration": config_hash(values)}  # the data are not read
         values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
         values["run"]["device"] = device
+        if values["render"]["backend"] in missing_backends(device):
+            values["render"]["backend"] = "auto"
     except (YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RunFolderError(f"{settings} is not a configuration of padgs-run ({error}); restore it") from error
     try:
@@ -182,3 +186,9 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         method.load_state(state)
         iteration = Progress(**state.values[PROGRESS]).iteration
     return LoadedRun(store.path, config, method, store.result(), iteration, digest)
+
+
+def missing_backends(device: str) -> set[str]:
+    """Return the native backends that cannot render on a device (auto, cpu or cuda) of this machine."""
+    gpu = torch.cuda.is_available() and device != "cpu"
+    return {name for name, usable in {"cpu": device != "cuda", "cuda": gpu}.items() if not usable}

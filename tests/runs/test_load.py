@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
 from support.tiny_run import tiny_run
 
 import padgs
@@ -15,7 +16,8 @@ from padgs.data.capture import DataError
 from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
 from padgs.results import read
-from padgs.runs.store import RunFolderError
+from padgs.runs.load import missing_backends
+from padgs.runs.store import RunFolderError, config_hash
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +95,25 @@ def test_low_passes_keep_their_angle_where_a_short_run_had_one_sample(tmp_path_f
     assert (run.config.render.supersampling, run.method.model.supersampling) == (2, 1)
     finer = run.through(Panorama(4 * run.scene.train[0].width, 4 * run.scene.train[0].height))
     assert finer.render_config.low_pass == pytest.approx(16 * run.config.render.low_pass)
+
+
+def test_a_run_of_a_gpu_opens_without_one(folder, tmp_path, monkeypatch):
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    settings = (copy / "config.yaml").read_text()
+    trained = config_hash(yaml.safe_load(settings))
+    monkeypatch.setattr("padgs.runs.load.config_hash", lambda _: trained)
+    (copy / "config.yaml").write_text(settings.replace("backend: auto", "backend: cuda"))
+    run = padgs.load_run(copy, device="cpu")
+    assert "backend: cuda" in (copy / "config.yaml").read_text() and run.config.render.backend == "auto"
+    assert run.render(run.scene.test[0]).image.max() > 0
+
+
+def test_backends_stay_where_they_can_render(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [missing_backends(device) for device in ("auto", "cpu", "cuda")] == [set(), {"cuda"}, {"cpu"}]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert [missing_backends(device) for device in ("auto", "cpu")] == [{"cuda"}, {"cuda"}]
 
 
 def test_an_unfinished_run_is_loaded(folder, tmp_path):
