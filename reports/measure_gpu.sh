@@ -36,10 +36,10 @@ bench() {
 }
 kernels() { $python -m pytest -q -m cuda tests/render/cuda --junitxml="$out/kernels.xml"; }
 tests() { $python -m pytest -q -m cuda tests/render --ignore=tests/render/cuda --junitxml="$out/tests.xml"; }
+# The files at the same time, since a sanitizer keeps only one core busy.
 sanitizer() {
-  compute-sanitizer --tool "$1" --error-exitcode 99 $python -m pytest -q -x -m cuda -k "not long and not any_size" \
-    tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_decoder.py tests/render/cuda/test_cuda_loss.py \
-    tests/render/cuda/test_cuda_splats.py
+  printf '%s\n' backend decoder loss splats | xargs -P 4 -I FILE compute-sanitizer --tool "$1" --error-exitcode 99 \
+    $python -m pytest -q -x -m cuda -k "not long and not any_size" tests/render/cuda/test_cuda_FILE.py
 }
 # Without torch's caching allocator, whose large blocks count as initialized.
 memcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer memcheck; }

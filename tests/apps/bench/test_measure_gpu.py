@@ -60,10 +60,13 @@ def test_the_benchmark_comes_first_and_finished_steps_are_skipped(measure, tmp_p
     assert calls == [
         "tests ",
         "tests ",
-        *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck")),
+        *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck") for _ in range(4)),  # files
     ]
     assert line.endswith("racecheck initcheck; not verified: nothing")
     assert measure()[1] == []
+    (tmp_path / "build/gpu/out/memcheck.state").unlink()
+    assert "not verified: memcheck (failed" in measure(BROKEN="yes")[0], "one file that fails fails the step"
+    measure()
     assert json.loads((tmp_path / "reports/measured/some-gpu.json").read_text())["steps"]["racecheck"] == "ok"
 
 
