@@ -138,6 +138,8 @@ class Trainer:
             with stage("draw"):
                 rendered = self.corrections.renderer(model)(view)
                 image = self.corrections.exposed(rendered.rendering.image, index)
+                if options.random_background:
+                    image = image + rendered.rendering.transmittance[..., None] * background(iteration).to(image)
             if len(rendered.gaussians) == 0:
                 optimizer.refuse_non_finite(optimizer.parameters(), iteration)  # NaN parameters draw nothing either
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
@@ -195,3 +197,8 @@ class Trainer:
             setattr(self, name, state.values[name])
         for name in ("monitor", "early_stopping"):
             getattr(self, f"_{name}").state = copy.deepcopy(state.values[name])
+
+
+def background(iteration: int) -> Tensor:
+    """Return the random colour [3] of an iteration; without a state, so that a resumed run goes on alike."""
+    return torch.rand(3, generator=torch.Generator().manual_seed(iteration))

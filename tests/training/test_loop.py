@@ -16,7 +16,7 @@ from padgs.render import Rendering
 from padgs.scene import View
 from padgs.training import schedule as schedules
 from padgs.training.health import Failure
-from padgs.training.loop import Trainer
+from padgs.training.loop import Trainer, background
 from padgs.training.model import State, TrainingRender
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
@@ -377,3 +377,27 @@ def test_resuming_in_a_budget_of_seconds_changes_nothing_but_what_the_clock_does
     resumed.load_state(state)
     assert [*first, *resumed.records()] == expected
     assert_same_but_time(resumed.state(), whole.state())
+
+
+class Transparent(Flat):
+    """Draws nothing where the photographs are black, and nothing else."""
+
+    def draw(self, view: View) -> TrainingRender:
+        drawn = super().draw(view)
+        clear = torch.ones(view.height, view.width)
+        return replace(drawn, rendering=replace(drawn.rendering, image=0 * drawn.rendering.image, transmittance=clear))
+
+
+def test_transparency_is_no_black_before_random_backgrounds():
+    scene = tiny_scene()
+    dark = replace(scene, train=tuple(replace(v, load_pixels=lambda v=v: 0 * v.load_pixels()) for v in scene.train))
+    losses = [
+        [
+            record.loss
+            for record in Trainer(Transparent(), dark, Budget(3), TrainOptions(lambda_l1=1.0, **options)).records()
+        ]
+        for options in ({}, {"random_background": True})
+    ]
+    assert losses[0] == [0, 0, 0]
+    assert losses[1] == pytest.approx([background(iteration).mean().item() for iteration in (1, 2, 3)])
+    assert len(set(losses[1])) == 3 and all(0 < loss < 1 for loss in losses[1])

@@ -127,7 +127,7 @@ class PlusMethod(SplatMethod):
     Options = PlusOptions
     MODEL = PlusModel
     RENDER = RenderConfig(projection="ray", low_pass=PIXEL_VARIANCE, supersampling=2)
-    TRAIN = TrainOptions(weight="solid_angle", square_weight=20.0, adam_beta2=0.99)
+    TRAIN = TrainOptions(weight="solid_angle", square_weight=20.0, random_background=True, adam_beta2=0.99)
 
     @property
     def has_smoothing_filter(self) -> bool:

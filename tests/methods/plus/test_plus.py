@@ -339,3 +339,12 @@ def test_the_change_by_samples_is_relative_to_the_error(share, gains):
     views = tuple(map(as_rendered, scene.train))
     model = method.build_model(replace(scene, train=views), 20)
     assert model._gains_by_supersampling() == gains
+
+
+def test_black_is_opaque_with_random_backgrounds():
+    scene, clear = tiny_scene(), []  # most of which is black
+    for random_background in (False, True):
+        method = PlusMethod(train=replace(PlusMethod.TRAIN, random_background=random_background))
+        list(method.fit(scene, Budget(150)))
+        clear.append(method.render(scene.train[0]).transmittance.mean().item())
+    assert clear[0] > 0.3 and clear[1] < 0.05
