@@ -138,13 +138,13 @@ class Trainer:
             with stage("draw"):
                 rendered = self.corrections.renderer(model)(view)
                 image = self.corrections.exposed(rendered.rendering.image, index)
-                if options.random_background:
-                    image = image + rendered.rendering.transmittance[..., None] * background(iteration).to(image)
             if len(rendered.gaussians) == 0:
                 optimizer.refuse_non_finite(optimizer.parameters(), iteration)  # NaN parameters draw nothing either
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
+                if options.random_background:
+                    image = target.before(background(iteration), image, rendered.rendering.transmittance)
                 loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))

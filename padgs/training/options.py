@@ -71,8 +71,8 @@ class TrainOptions:
 
     lambda_l1: float = 0.8  # lambda of Eq. 16
     square_weight: float = 0.0  # weight of the squared error, added to the loss in the last 40 % of a run
-    # Another colour behind each training render: transparency cannot stand for black. It shows as holes in views that
-    # see past the edge of what training views see. Finished models have black behind them.
+    # Another colour behind each training render, where the photograph is not black: transparency cannot stand for dark
+    # surfaces, which would be holes in other views. Finished models have black behind them.
     random_background: bool = False
     adam_beta2: float = 0.999  # decay of Adam's second moments
     weight: str = "solid_angle"  # M of Eq. 17: solid_angle | uniform | end_rows (as released: 0 at the poles)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 CACHE_BYTES = 1 << 29  # weights of views beyond this are computed again at every iteration
 SLACK = 0.01  # of the sphere, by which photographs may show more than a panorama in one iteration
 MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
+BLACK = 8 / 255  # brightest value of a pixel that may show nothing
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,14 @@ class Target:
             return loss
         more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
         return loss + options.depth_weight * more
+
+    def before(self, color: Tensor, image: Tensor, transmittance: Tensor) -> Tensor:
+        """Return a render [H, W, 3] in front of a colour [3]; of black, where the photograph is black.
+
+        Black pixels may be a void, such as the sky or the holes of a scan, which is to stay empty.
+        """
+        lit = self.image.amax(-1) > BLACK
+        return image + (transmittance * lit)[..., None] * color.to(image)
 
     def squares(self, image: Tensor, options: TrainOptions, progress: float) -> Tensor | float:
         """Return what squared errors of an image [H, W, 3] add to the loss at a share of the run."""

@@ -66,3 +66,14 @@ def test_squared_errors_count_at_the_end_of_a_run(generator, masked):
     squares = (weight[..., None] * (image - target).square()).sum() / (3 * weight.expand(16, 32).sum())
     assert found.squares(image, plain, 1.0) == found.squares(image, options, 0.6) == 0
     assert found.squares(image, options, 0.61).item() == pytest.approx(3 * squares.item(), rel=1e-5)
+
+
+def test_black_pixels_keep_black_behind_them():
+    photograph = torch.zeros(2, 4, 3)
+    photograph[0, :, 1] = 0.5
+    transmittance = torch.full((2, 4), 0.25, requires_grad=True)
+    color = torch.tensor([0.0, 0.4, 1.0])
+    seen = Target(photograph, torch.ones(2, 1)).before(color, torch.zeros(2, 4, 3), transmittance)
+    assert torch.equal(seen[0], (0.25 * color).expand(4, 3)) and not seen[1].any()
+    seen.sum().backward()
+    assert torch.allclose(transmittance.grad, torch.tensor([[1.4], [0.0]]).expand(2, 4))
