@@ -56,7 +56,7 @@ class Target:
         Black pixels may be a void, such as the sky or the holes of a scan, which is to stay empty.
         """
         lit = self.image.amax(-1) > BLACK
-        return image + (transmittance * lit)[..., None] * color.to(image)
+        return image + (transmittance * lit)[..., None] * color.to(image, non_blocking=True)
 
     def squares(self, image: Tensor, options: TrainOptions, progress: float) -> Tensor | float:
         """Return what squared errors of an image [H, W, 3] add to the loss at a share of the run."""
