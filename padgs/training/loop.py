@@ -199,6 +199,6 @@ class Trainer:
             getattr(self, f"_{name}").state = copy.deepcopy(state.values[name])
 
 
-def background(iteration: int) -> Tensor:
-    """Return the random colour [3] of an iteration; without a state, so that a resumed run goes on alike."""
-    return torch.rand(3, generator=torch.Generator().manual_seed(iteration))
+def background(iteration: int) -> list[float]:
+    """Return the random colour of an iteration; without a state, so that a resumed run goes on alike."""
+    return torch.rand(3, generator=torch.Generator().manual_seed(iteration)).tolist()

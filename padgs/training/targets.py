@@ -50,13 +50,14 @@ class Target:
         more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
         return loss + options.depth_weight * more
 
-    def before(self, color: Tensor, image: Tensor, transmittance: Tensor) -> Tensor:
-        """Return a render [H, W, 3] in front of a colour [3]; of black, where the photograph is black.
+    def before(self, color: Sequence[float], image: Tensor, transmittance: Tensor) -> Tensor:
+        """Return a render [H, W, 3] in front of a colour, three numbers; of black, where the photograph is black.
 
         Black pixels may be a void, such as the sky or the holes of a scan, which is to stay empty.
         """
         lit = self.image.amax(-1) > BLACK
-        return image + (transmittance * lit)[..., None] * color.to(image, non_blocking=True)
+        behind = transmittance * lit
+        return image + torch.stack([behind * value for value in color], dim=-1)  # a tensor sent to a GPU would wait
 
     def squares(self, image: Tensor, options: TrainOptions, progress: float) -> Tensor | float:
         """Return what squared errors of an image [H, W, 3] add to the loss at a share of the run."""
