@@ -144,7 +144,7 @@ class Trainer:
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
                 if options.random_background:
-                    image = target.before(background(iteration), image, rendered.rendering.transmittance)
+                    image = target.with_background(image, rendered.rendering.transmittance, background(iteration))
                 loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))

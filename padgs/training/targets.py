@@ -50,14 +50,14 @@ class Target:
         more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
         return loss + options.depth_weight * more
 
-    def before(self, color: Sequence[float], image: Tensor, transmittance: Tensor) -> Tensor:
-        """Return a render [H, W, 3] in front of a colour, three numbers; of black, where the photograph is black.
+    def with_background(self, image: Tensor, transmittance: Tensor, color: Sequence[float]) -> Tensor:
+        """Return a render [H, W, 3] over a colour (three numbers), or over black where the photograph is black.
 
         Black pixels may be a void, such as the sky or the holes of a scan, which is to stay empty.
         """
         lit = self.image.amax(-1) > BLACK
         behind = transmittance * lit
-        return image + torch.stack([behind * value for value in color], dim=-1)  # a tensor sent to a GPU would wait
+        return image + torch.stack([behind * value for value in color], dim=-1)  # sending a tensor would wait for a GPU
 
     def squares(self, image: Tensor, options: TrainOptions, progress: float) -> Tensor | float:
         """Return what squared errors of an image [H, W, 3] add to the loss at a share of the run."""

@@ -391,10 +391,8 @@ class Transparent(Flat):
 @pytest.mark.parametrize(("grey", "random_background"), [(51, False), (51, True), (0, True)])
 def test_random_backgrounds_are_behind_all_but_black(grey, random_background):
     views = tuple(replace(v, load_pixels=lambda v=v: 0 * v.load_pixels() + grey) for v in tiny_scene().train)
-    scene, options = (
-        replace(tiny_scene(), train=views),
-        TrainOptions(lambda_l1=1.0, random_background=random_background),
-    )
+    options = TrainOptions(lambda_l1=1.0, random_background=random_background)
+    scene = replace(tiny_scene(), train=views)
     losses = [record.loss for record in Trainer(Transparent(), scene, Budget(3), options).records()]
     colors = [background(iteration) if random_background and grey else [0.0] * 3 for iteration in (1, 2, 3)]
     assert losses == pytest.approx([sum(abs(value - grey / 255) for value in color) / 3 for color in colors])

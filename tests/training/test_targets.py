@@ -73,7 +73,7 @@ def test_black_pixels_keep_black_behind_them():
     photograph[0, :, 1] = 0.5
     transmittance = torch.full((2, 4), 0.25, requires_grad=True)
     color = [0.0, 0.4, 1.0]
-    seen = Target(photograph, torch.ones(2, 1)).before(color, torch.zeros(2, 4, 3), transmittance)
+    seen = Target(photograph, torch.ones(2, 1)).with_background(torch.zeros(2, 4, 3), transmittance, color)
     assert torch.allclose(seen[0], torch.tensor([0.0, 0.1, 0.25])) and not seen[1].any()
     seen.sum().backward()
     assert torch.allclose(transmittance.grad, torch.tensor([[1.4], [0.0]]).expand(2, 4))

@@ -111,8 +111,8 @@ def test_splat_iterations_do_not_wait(kind: str):
     options, config = DensificationOptions(positional_gradient=kind), RenderConfig("ray", backend="cuda")
     with pretended_gpu() as waits, call_hook(stage_of(called := [])):
         model = SplatModel(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
-        options = TrainOptions(random_background=True)
-        trainer = Trainer(model, resident(work.scene, GPU), Budget(30_000), options)
+        scene, train = resident(work.scene, GPU), TrainOptions(random_background=True)
+        trainer = Trainer(model, scene, Budget(30_000), train)
         waited = steps_of(trainer, waits)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts instances
     assert called.count("padgs_cuda_splats") == 2 * STEPS and model.densifier.statistics["gradient"].held.any()
