@@ -100,7 +100,14 @@ class Optimizer:
         self.pace = pace
         for group, settings in zip(self._groups, self.adam.param_groups, strict=True):
             settings["lr"] = group.learning_rate(step) * (pace(step) if pace and group.paced else 1.0)
+        # Adam steps from 0 where rows have factors, so that these act on exact steps.
+        scaled = [(part, group.row_rates()) for group in self._groups if group.row_rates for part in group.parameters]
+        befores = [part.detach().clone() for part, _ in scaled]
+        for part, _ in scaled:
+            part.data.zero_()
         self.adam.step()
+        for (part, factors), before in zip(scaled, befores, strict=True):
+            part.data.mul_(factors).add_(before)
         self.adam.zero_grad(set_to_none=True)
 
     def is_checked(self, iteration: int) -> bool:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from torch import nn
+from torch import Tensor, nn
 
 PUBLISHED_ITERATIONS = 30_000  # length of all published schedules
 LEARNING_RATES = ("published", "run", "run_linear")
@@ -23,6 +23,7 @@ class ParameterGroup:
     parameters: tuple[nn.Parameter, ...]
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
     paced: bool = True  # whether it follows `Pace`; learned cameras do not
+    row_rates: Callable[[], Tensor] | None = None  # factors [N, 1] on the learning rate of rows; None: all are 1
 
 
 @dataclass(frozen=True)

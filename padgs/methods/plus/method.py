@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields, replace
 from padgs.checks import check
 from padgs.methods.plus.model import PlusModel
 from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.lengths import NEAREST_CAMERA
 from padgs.methods.splats.method import PRUNE_PSNR, SplatMethod, SplatOptions
 from padgs.render import RenderConfig
 from padgs.scene import Scene
@@ -62,6 +63,7 @@ class PlusOptions(SplatOptions):
     supersampling_from: float = 0.7
     supersampling_iterations: int = 1200  # shorter runs have one sample a pixel but for `supersampling_share`
     supersampling_share: float = 0.25  # a shorter run has several if they change its views by this share of the error
+    length_unit: str = NEAREST_CAMERA
     means_rate_factor: float = 2.0
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large

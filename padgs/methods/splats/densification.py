@@ -95,18 +95,19 @@ class Densifier:
         options: DensificationOptions,
         *,
         extent: float,
+        extents: Callable[[Tensor], Tensor] | None = None,
         target: int | None = None,
         rendered_opacities: Callable[[], Tensor] | None = None,
         seed: int = 0,
     ) -> None:
         """Start with empty statistics; `options` have iterations of the run, see `DensificationOptions.for_run`.
 
-        Sizes are compared with `extent`, world units. `target` is the number of Gaussians to reach by the last round,
-        in equal steps; None: as many as thresholds give. `rendered_opacities` returns opacities [N] in [0, 1] after
-        filters, at most the stored ones.
+        Sizes are compared with `extent`, world units, or with what `extents` returns [N] for means [N, 3]. `target` is
+        the number of Gaussians to reach by the last round, in equal steps; None: as many as thresholds give.
+        `rendered_opacities` returns opacities [N] in [0, 1] after filters, at most the stored ones.
         """
         self._rendered_opacities = rendered_opacities or (lambda: torch.sigmoid(splats.opacity_logits))
-        self.splats, self.options, self.extent = splats, options, extent
+        self.splats, self.options, self.extent, self._extents = splats, options, extent, extents
         self._target = target
         self.generator = torch.Generator().manual_seed(seed)
         self.statistics = self._empty()
@@ -160,7 +161,7 @@ class Densifier:
             room = max(0, self.options.max_gaussians - len(chosen))
             if candidate_count > room:
                 chosen = _largest(torch.where(chosen, mean_gradient, -1.0), room)
-        small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
+        small = ~self._is_larger(self.options.percent_dense)
         clones = self._copies(chosen & small, 1, sampled=self.options.sample_clones)
         pieces = self._pieces(chosen & ~small)
         append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name])) for name in rows})
@@ -226,9 +227,14 @@ class Densifier:
         # Not ">=": NaN stays, so that the loop finds and reports it.
         keep = ~(torch.sigmoid(self.splats.opacity_logits) < self.options.min_opacity)
         if self.options.prune_by_extent and iteration > self.options.prune_by_extent_from:
-            keep &= ~(torch.exp(self.splats.log_scales).amax(-1) > self.options.max_scale * self.extent)
+            keep &= ~self._is_larger(self.options.max_scale)
         keep_rows(self.splats.rows(), optimizer, keep)
         return int((~keep).sum())
+
+    def _is_larger(self, size: float) -> Tensor:
+        """Return which Gaussians [N] have a scale above `size` extents."""
+        extent = self.extent if self._extents is None else self._extents(self.splats.means)
+        return torch.exp(self.splats.log_scales).amax(-1) > size * extent
 
     def _decay_opacities(self, optimizer: torch.optim.Adam) -> None:
         if self.options.opacity_decay > 0:

@@ -11,11 +11,12 @@ from typing import ClassVar
 
 import torch
 
-from padgs.checks import check
+from padgs.checks import check, check_known
 from padgs.geometry.harmonics import MAX_DEGREE
 from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.depth_initialization import far_gaussians, fill_sparse_cloud, room_count, solid_angle_pixels
 from padgs.methods.splats.importance import GROWN_PER_KEPT
+from padgs.methods.splats.lengths import EXTENT, LENGTH_UNITS
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
 from padgs.scene import Scene, View
@@ -40,6 +41,9 @@ class SplatOptions(DensificationOptions, ExtentOptions):
     depth_init_per_pixel: float = 0.0  # a sparser cloud is filled from training pixels by plane sweep; 0: never
     sky_per_point: float = 0.0  # directions per initial point that get a far Gaussian if no point is there
     limit_per_pixel: float | None = None  # maximal Gaussians per independent pixel, which bounds memory and time
+    # Length that steps of the means and sizes are multiples of. extent: that of all cameras (3DGS). nearest_camera: of
+    # each Gaussian, by its distance to the nearest training camera (`padgs.methods.splats.lengths`).
+    length_unit: str = EXTENT
     means_rate_factor: float = 1.0  # factor on the learning rate of the means in 3DGS
     prune_psnr: float | None = None  # dB to which the least important are pruned; None: by `budget.gaussians` only
     supersampling_from: float = 0.0  # share of the run with one sample a pixel, before `render.supersampling` acts
@@ -55,6 +59,7 @@ class SplatOptions(DensificationOptions, ExtentOptions):
         check(self, "a share of the run in [0, 1)", lambda share: 0 <= share < 1, "supersampling_from")
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_rate_factor")
+        check_known(self, length_unit=LENGTH_UNITS)
         check(self, "> 0 and finite, or none for no pruning", lambda p: p is None or 0 < p < math.inf, "prune_psnr")
         off = "at least 0, which switches it off"
         check(self, off, lambda value: 0 <= value < math.inf, "sky_per_point", "depth_init_per_pixel")
@@ -167,4 +172,5 @@ class SplatMethod(Method):
             smoothing_filter=options.smoothing_filter,
             means_rate_factor=options.means_rate_factor,
             supersampling_from=options.supersampling_from,
+            length_unit=options.length_unit,
         )

@@ -11,6 +11,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.methods.splats.densification import MIN_DENSIFY_EVERY, DensificationOptions, Densifier
 from padgs.methods.splats.importance import PruningStep, importance_scores, most_important
+from padgs.methods.splats.lengths import EXTENT, NEAREST_CAMERA, LocalLengths
 from padgs.methods.splats.smoothing_filter import SmoothingFilter, cameras_of, finest_pixels, widened
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering, RenderOptions, render
@@ -23,6 +24,7 @@ from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
 
 OFFSET_COLUMNS = {"image": 2, "space": 3, "space_absolute": 4}  # of `mean_offsets`, by positional gradient
 FILTER_VARIANCES = "filter/variances"  # key in a state
+LENGTHS = "lengths"  # key in a state
 DEGREE_EVERY = 1000  # published iterations between two SH degrees
 
 
@@ -48,33 +50,37 @@ class SplatModel:
         smoothing_filter: float = 0.0,
         means_rate_factor: float = 1.0,
         supersampling_from: float = 0.0,
+        length_unit: str = EXTENT,
     ) -> None:
         """Wrap splats for a run of `iterations`, with training `views` unless they are only rendered.
 
         `options` are those of a published run; `extent` is in world units; `target` as in `Densifier`; `requested` and
         `prune_psnr` as in `PruningStep`; `smoothing_filter` is the variance of `SmoothingFilter`, 0 for none; training
-        renders have one sample a pixel before the share `supersampling_from` of the run.
+        renders have one sample a pixel before the share `supersampling_from` of the run; `length_unit` as in
+        `padgs.methods.splats.method.SplatOptions`.
         """
         self.splats, self.options, self.iterations = splats, options, iterations
         self._config, self._views, self._extent, self._means_rate_factor = config, views, extent, means_rate_factor
         self._supersampling_from = supersampling_from
         self._step = 0  # last step of the schedule
+        self._lengths = LocalLengths(cameras_of(views)) if length_unit == NEAREST_CAMERA else None
         self.densifier = Densifier(
             splats,
             options.for_run(iterations),
             extent=extent,
             target=target,
+            extents=None if self._lengths is None else self._lengths.at,
             rendered_opacities=self._rendered_opacities,
             seed=seed,
         )
         self.pruning = PruningStep(self.densifier.options, iterations, requested=requested, prune_psnr=prune_psnr)
         self._filter = SmoothingFilter(smoothing_filter, cameras_of(views)) if smoothing_filter > 0 else None
-        if self._filter is not None:
-            self._filter.update(splats.means)
+        self._follow()
 
     def groups(self) -> list[ParameterGroup]:
-        """Return the learning rates of 3DGS; that of the means decays over the run and scales with the extent."""
-        splats, factor = self.splats, self._means_rate_factor * self._extent
+        """Return the learning rates of 3DGS; that of the means decays over the run and scales with `length_unit`."""
+        splats, lengths = self.splats, self._lengths
+        factor = self._means_rate_factor * (self._extent if lengths is None else 1.0)
         rates = {
             "means": LogLinear(1.6e-4 * factor, 1.6e-6 * factor, self.iterations),
             "quats": Constant(1e-3),
@@ -83,8 +89,9 @@ class SplatModel:
             "sh_dc": Constant(2.5e-3),
             "sh_rest": Constant(2.5e-3 / 20),
         }
+        of_rows = {} if lengths is None else {"means": lambda: lengths.values}
         rows = splats.rows()
-        return [ParameterGroup(name, (rows[name],), rate) for name, rate in rates.items()]
+        return [ParameterGroup(name, (rows[name],), rate, row_rates=of_rows.get(name)) for name, rate in rates.items()]
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians, differentiably; `mean_offsets` of another render get the sum of both gradients."""
@@ -147,10 +154,15 @@ class SplatModel:
         return (f"pruned the least important of {before} Gaussians, kept {kept}",)
 
     def follow(self, iteration: int) -> None:
-        """Let the smoothing filter follow the means: after rows changed, at least once a round, and at the end."""
-        smooth, is_due = self._filter, iteration % self.densifier.options.densify_every == 0
-        if smooth is not None and (is_due or iteration >= self.iterations or len(smooth.variances) != len(self.splats)):
-            smooth.update(self.splats.means)
+        """Let filter and lengths follow the means: after rows changed, at least once a round, and at the end."""
+        is_due = iteration >= self.iterations or iteration % self.densifier.options.densify_every == 0
+        self._follow(unless=None if is_due else len(self.splats))
+
+    def _follow(self, unless: int | None = None) -> None:
+        """Update filter and lengths, but not those that have as many rows as `unless`."""
+        for part in (self._filter, self._lengths):
+            if part is not None and len(part) != unless:
+                part.update(self.splats.means)
 
     def _prune_invisible(self, smooth: SmoothingFilter, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         splats = self.splats
@@ -204,6 +216,8 @@ class SplatModel:
         tensors["random/pieces"] = self.densifier.generator.get_state()
         if self._filter is not None:
             tensors[FILTER_VARIANCES] = self._filter.variances
+        if self._lengths is not None:
+            tensors[LENGTHS] = self._lengths.values
         values = {
             "active_degree": self.splats.active_degree,
             "degree": self.splats.degree,
@@ -224,6 +238,8 @@ class SplatModel:
         self.pruning.done, self._step = state.values["pruned"], state.values["step"]
         if self._filter is not None:
             self._filter.variances = state.tensors[FILTER_VARIANCES].to(device, copy=True)
+        if self._lengths is not None:
+            self._lengths.values = state.tensors[LENGTHS].to(device, copy=True)
 
     def load_model(self, state: State) -> None:
         """Load the parameters only, as those of a finished schedule until `adapt` says otherwise."""
@@ -232,8 +248,7 @@ class SplatModel:
         self.splats.scene_scale = state.values["scene_scale"]
         self._step = self.iterations
         self.densifier.reset_statistics()
-        if self._filter is not None:
-            self._filter.update(self.splats.means)
+        self._follow()
 
     @torch.no_grad()
     def _rendered_opacities(self) -> Tensor:

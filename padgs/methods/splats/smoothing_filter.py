@@ -37,6 +37,12 @@ def finest_pixels(means: Tensor, cameras: Tensor) -> Tensor:
     return reduce(torch.minimum, widths)  # camera by camera: N x V numbers may not fit into memory
 
 
+@torch.no_grad()
+def nearest_distances(means: Tensor, cameras: Tensor) -> Tensor:
+    """Return the distances [N] in world units of means [N, 3] to the nearest of cameras [V, 4] from `cameras_of`."""
+    return finest_pixels(means, torch.cat((cameras[:, :3], torch.ones_like(cameras[:, 3:])), dim=1))
+
+
 def smoothed_for_view(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) -> Gaussians:
     """Return Gaussians that a `solid` low-pass of the view makes as wide as training views with `pixels` [N] would.
 
@@ -59,6 +65,9 @@ class SmoothingFilter:
         """Set the variance in square pixels of the cameras [V, 4] from `cameras_of`."""
         self.square_pixels, self.cameras = square_pixels, cameras
         self.variances = torch.zeros(0)
+
+    def __len__(self) -> int:
+        return len(self.variances)
 
     def update(self, means: Tensor) -> None:
         """Measure the finest pixel at each of the means [N, 3]."""

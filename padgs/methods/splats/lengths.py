@@ -1,0 +1,38 @@
+"""The length that the steps and sizes of each Gaussian are multiples of.
+
+3DGS takes the extent of all cameras. In one room that is about the distance to the walls, in ten rooms ten times as
+much: means then move by pixels at a time, and Gaussians as large as furniture are cloned rather than split. The
+distance to the nearest training camera is of the right size everywhere, in rooms, on streets and in the sky.
+"""
+
+import torch
+from torch import Tensor
+
+from padgs.methods.splats.smoothing_filter import nearest_distances
+
+EXTENT, NEAREST_CAMERA = "extent", "nearest_camera"
+LENGTH_UNITS = (EXTENT, NEAREST_CAMERA)
+EXTENT_PER_DISTANCE = 1.5  # as in single rooms: the extent over the median distance of points to the nearest camera
+
+
+class LocalLengths:
+    """`EXTENT_PER_DISTANCE` times the distance of each Gaussian to the nearest training camera.
+
+    `values` [N, 1], world units, have no derivative and follow the means whenever they are updated.
+    """
+
+    def __init__(self, cameras: Tensor) -> None:
+        """Take the training cameras [V, 4] from `cameras_of`."""
+        self._cameras = cameras
+        self.values = torch.zeros(0, 1)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def at(self, means: Tensor) -> Tensor:
+        """Return the lengths [N] at means [N, 3]."""
+        return EXTENT_PER_DISTANCE * nearest_distances(means.detach(), self._cameras)
+
+    def update(self, means: Tensor) -> None:
+        """Measure the lengths at the means [N, 3] of all Gaussians."""
+        self.values = self.at(means)[:, None]
