@@ -35,4 +35,5 @@ class LocalLengths:
 
     def update(self, means: Tensor) -> None:
         """Measure the lengths at the means [N, 3] of all Gaussians."""
+        self._cameras = self._cameras.to(means.device)  # copied once, or a GPU would wait each time
         self.values = self.at(means)[:, None]
