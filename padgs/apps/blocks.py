@@ -339,7 +339,8 @@ def _joined(runs: Sequence[LoadedRun], numbers: Sequence[int], regions: Mapping[
         state = run.method.state().of_model()
         means = state.tensors["splats/means"].double().cpu() + run.scene.origin.cpu()
         kept = torch.from_numpy(owner[tree.query(means.numpy())[1]] == number)
-        rows = {n: t[kept] for n, t in state.tensors.items() if n.startswith(("splats/", "statistics/", "filter/"))}
+        of_rows = ("splats/", "statistics/", "filter/", "lengths")
+        rows = {n: t[kept] for n, t in state.tensors.items() if n.startswith(of_rows)}
         rows["splats/means"] = (means[kept] - scene.origin.cpu()).to(state.tensors["splats/means"])
         parts.append(rows)
     stored = runs[0].method.state()

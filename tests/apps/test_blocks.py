@@ -60,7 +60,7 @@ def trained(folder: Path, runs: Path, *settings: str) -> str:
 @pytest.fixture(scope="module")
 def runs(parts, tmp_path_factory) -> list[str]:
     folder = tmp_path_factory.mktemp("runs")
-    return [trained(part, folder) for part in parts]
+    return [trained(part, folder, "method.length_unit=nearest_camera") for part in parts]
 
 
 @pytest.mark.parametrize("sizes", [(5, 5), (4, 6, 5), (9, 9, 9, 9, 9)])
@@ -148,7 +148,7 @@ def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, cap
         x = own[:, 0]
         assert kept[(x > 0.3) == side][x[(x > 0.3) == side].abs() > 0.3].float().mean() > 0.95
         count += int(kept.sum())
-    assert count == len(means)
+    assert count == len(means) == len(merged.method.model.groups()[0].row_rates())
     assert merge(runs[::-1], Console(quiet=True)) == path, "in any order"
 
 

@@ -189,6 +189,8 @@ class SplatModel:
         self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
         if self._filter is not None:
             self._filter.variances = self._filter.variances[rows]
+        if self._lengths is not None:
+            self._lengths.values = self._lengths.values[rows]
 
     def prune(self, count: int, views: Sequence[View]) -> None:
         self.keep(most_important(importance_scores(self, views), count))

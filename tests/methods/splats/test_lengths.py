@@ -10,6 +10,7 @@ from torch import nn
 from padgs.methods.splats.densification import DensificationOptions, Densifier
 from padgs.methods.splats.lengths import EXTENT, EXTENT_PER_DISTANCE, NEAREST_CAMERA, LocalLengths
 from padgs.methods.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.smoothing_filter import cameras_of
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
 from padgs.scene import Scene
@@ -116,6 +117,18 @@ def test_a_run_resumes_with_the_lengths_that_it_had():
     for _ in range(3):
         next(records), next(again)
     assert torch.equal(resumed.model.splats.means, whole.model.splats.means)
+
+
+def test_a_run_from_a_model_that_is_pruned_first_steps_in_its_lengths():
+    scene, source = tiny_scene(), fitted(tiny_scene(), NEAREST_CAMERA)
+    count = len(source.model.splats) // 2
+    method = SplatMethod(source.options, render=source.render_config)
+    method.warm_start(source.state())
+    records = method.fit(scene, Budget(100, gaussians=count))
+    lengths = method.model.groups()[0].row_rates()
+    assert torch.equal(lengths[:, 0], LocalLengths(cameras_of(scene.train)).at(method.model.splats.means))
+    assert len(lengths) == count
+    next(records)
 
 
 def test_an_unknown_unit_is_refused():
