@@ -8,7 +8,7 @@ distance to the nearest training camera is of the right size everywhere, in room
 import torch
 from torch import Tensor
 
-from padgs.methods.splats.smoothing_filter import nearest_distances
+from padgs.methods.splats.smoothing_filter import finest_pixels
 
 EXTENT, NEAREST_CAMERA = "extent", "nearest_camera"
 LENGTH_UNITS = (EXTENT, NEAREST_CAMERA)
@@ -23,7 +23,7 @@ class LocalLengths:
 
     def __init__(self, cameras: Tensor) -> None:
         """Take the training cameras [V, 4] from `cameras_of`."""
-        self._cameras = cameras
+        self._cameras = torch.cat((cameras[:, :3], torch.ones_like(cameras[:, 3:])), dim=1)  # a pixel is the distance
         self.values = torch.zeros(0, 1)
 
     def __len__(self) -> int:
@@ -31,7 +31,7 @@ class LocalLengths:
 
     def at(self, means: Tensor) -> Tensor:
         """Return the lengths [N] at means [N, 3]."""
-        return EXTENT_PER_DISTANCE * nearest_distances(means.detach(), self._cameras)
+        return EXTENT_PER_DISTANCE * finest_pixels(means.detach(), self._cameras)
 
     def update(self, means: Tensor) -> None:
         """Measure the lengths at the means [N, 3] of all Gaussians."""

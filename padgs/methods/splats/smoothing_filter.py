@@ -37,12 +37,6 @@ def finest_pixels(means: Tensor, cameras: Tensor) -> Tensor:
     return reduce(torch.minimum, widths)  # camera by camera: N x V numbers may not fit into memory
 
 
-@torch.no_grad()
-def nearest_distances(means: Tensor, cameras: Tensor) -> Tensor:
-    """Return the distances [N] in world units of means [N, 3] to the nearest of cameras [V, 4] from `cameras_of`."""
-    return finest_pixels(means, torch.cat((cameras[:, :3], torch.ones_like(cameras[:, 3:])), dim=1))
-
-
 def smoothed_for_view(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) -> Gaussians:
     """Return Gaussians that a `solid` low-pass of the view makes as wide as training views with `pixels` [N] would.
 
