@@ -78,7 +78,7 @@ def test_the_most_important_gaussians_are_kept():
     trained, tiny = [], tiny_scene()
     for psnr in (None, 44.0):
         method = PlusMethod(replace(OPTIONS, prune_psnr=psnr, dropout=0.0))
-        for record in islice(method.fit(tiny, Budget(100)), 9 * iterations_per_round(100)):
+        for record in islice(method.fit(tiny, Budget(200)), 9 * iterations_per_round(200)):
             before = record.counts["gaussians"]
         trained.append(method.model)
         assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
@@ -96,9 +96,11 @@ def test_a_budget_of_gaussians_is_enforced_at_the_end(iterations):
     assert last == 150
 
 
-@pytest.mark.parametrize(("gaussians", "chosen"), [(150, [31]), ("auto", [31]), (None, [])])
-def test_a_run_stopped_before_pruning_prunes_at_once_only_for_a_budget(gaussians, chosen):
-    budget, whole, again = Budget(100, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+@pytest.mark.parametrize(
+    ("iterations", "gaussians", "chosen"), [(100, 150, [31]), (100, "auto", [31]), (200, None, [])]
+)
+def test_a_run_stopped_before_pruning_prunes_at_once_only_for_a_budget(iterations, gaussians, chosen):
+    budget, whole, again = Budget(iterations, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
     counts, events = [], []
     for record in whole.fit(tiny_scene(), budget):
         counts.append(record.counts["gaussians"])

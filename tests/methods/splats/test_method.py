@@ -75,7 +75,7 @@ def test_every_explicit_method_takes_the_options_of_padgs_plus(name):
     tiny = tiny_scene()
     points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
     scene = replace(tiny, points=points, point_colors=tiny.point_colors.repeat(10, 1))
-    method.fit(scene, Budget(120))
+    method.fit(scene, Budget(300))
     model = method.model
     far = model.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
     assert method.start == 0.1 * 2000 + far.sum() and far.any(), "points and sky"
