@@ -18,7 +18,9 @@ from padgs.training.targets import even_weight, image_of
 
 GROWN_PER_KEPT = 2  # Gaussians before the pruning step per Gaussian after it, about
 MIN_KEPT_SHARE = 0.1  # of the rows stays in one pruning step, whatever the scores
-RECOVERY = 100  # iterations; with 22 after the step `bedroom` loses 15 dB at 256x128, with 55 2.2 dB, with 110 0.3 dB
+RECOVERY = (
+    100  # iterations that must follow the step: at 256x128 `bedroom` loses 15 dB with 22, 2.2 with 55, 0.3 with 110
+)
 
 
 @dataclass(frozen=True)
@@ -68,22 +70,23 @@ def count_for_psnr(scores: Importance, psnr: float) -> int:
     return max(math.ceil(MIN_KEPT_SHARE * len(changes)), int((changes > 10 ** (-psnr / 10)).sum()))
 
 
+def pruning_iteration(options: DensificationOptions) -> int:
+    """Return the iteration of the pruning step: a round after densification ends. `options` are those of the run."""
+    return options.densify_until - 1 + options.densify_every
+
+
 class PruningStep:
-    """Schedule of the one pruning by importance, a round after densification ends, at iteration `due` unless `done`."""
+    """Schedule of the one pruning by importance, at iteration `due` unless `done`."""
 
-    def __init__(
-        self, options: DensificationOptions, iterations: int, *, requested: int | str | None, prune_psnr: float | None
-    ) -> None:
-        """Plan the step for a run of `iterations`, whose `options` are from `DensificationOptions.for_run`.
+    def __init__(self, options: DensificationOptions, *, requested: int | str | None, prune_psnr: float | None) -> None:
+        """Plan the step of a run with these `options`, which are from `DensificationOptions.for_run`.
 
-        `requested` is `budget.gaussians`: the number that stays; auto or None: `count_for_psnr(prune_psnr)`. With None
-        nothing is pruned if fewer than `RECOVERY` iterations follow.
+        `requested` is `budget.gaussians`: the number that stays; auto or None: `count_for_psnr(prune_psnr)`. Without
+        `prune_psnr` there is no step.
         """
-        self.due = options.densify_until - 1 + options.densify_every
+        self._requested, self._prune_psnr = requested, prune_psnr
+        self.due = pruning_iteration(options)
         self.done = False
-        is_too_late = requested is None and iterations - self.due < RECOVERY
-        self._iterations, self._requested = iterations, requested
-        self._prune_psnr = None if is_too_late else prune_psnr
 
     def is_ahead(self, iteration: int) -> bool:
         """Return whether the step comes after this iteration."""
@@ -92,15 +95,14 @@ class PruningStep:
     def is_due(self, iteration: int) -> bool:
         """Return whether it is time to prune.
 
-        If early stopping skipped the step, prune later, but only for a requested budget; a requested number is enforced
-        at the end of the run at the latest. Without a budget nothing is pruned late, as little training would follow.
+        If early stopping skipped the step, prune later, but only for a requested budget. Without a budget nothing is
+        pruned late, as little training would follow.
         """
         if self._prune_psnr is None:
             return False
         if self._requested is None:
             return iteration == self.due
-        due = min(self.due, self._iterations) if isinstance(self._requested, int) else self.due
-        return iteration >= due and not self.done
+        return iteration >= self.due and not self.done
 
     def count(self, scores: Importance) -> int:
         """Return how many of the scored rows stay."""

@@ -15,7 +15,7 @@ from padgs.checks import check, check_known
 from padgs.geometry.harmonics import MAX_DEGREE
 from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.depth_initialization import far_gaussians, fill_sparse_cloud, room_count, solid_angle_pixels
-from padgs.methods.splats.importance import GROWN_PER_KEPT
+from padgs.methods.splats.importance import GROWN_PER_KEPT, RECOVERY, pruning_iteration
 from padgs.methods.splats.lengths import EXTENT, LENGTH_UNITS
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
@@ -109,7 +109,8 @@ class SplatMethod(Method):
         shares = (options.initial_per_pixel, options.limit_per_pixel, options.depth_init_per_pixel or None)
         pixels = room_count(scene) * solid_angle_pixels(scene.train[0]) if any(shares) else 0.0
         start, limit, filled = (None if share is None else max(1, round(share * pixels)) for share in shares)
-        limit = lowest_limit(options.max_gaussians, limit if self._target is None else self._target)
+        target = self._target(iterations)
+        limit = lowest_limit(options.max_gaussians, limit if target is None else target)
         for_points = None if limit is None else math.ceil(limit / (1 + options.sky_per_point))
         start = lowest_limit(start, for_points)
         points, generator = self._filled_scene(scene, (lowest_limit(filled, start) or 0) if filled else 0)
@@ -141,11 +142,16 @@ class SplatMethod(Method):
         generator.set_state(self._filled[3])
         return self._filled[2], generator
 
-    @property
-    def _target(self) -> int | None:
-        """Number of Gaussians that densification aims at, if the budget is a number; twice that before pruning."""
+    def _prune_psnr(self, iterations: int) -> float | None:
+        """Return the PSNR of the pruning step; None: there is none, as training would not recover from it."""
+        due = pruning_iteration(self.options.for_run(iterations))
+        asked = self.options.prune_psnr or (PRUNE_PSNR if self._gaussians == AUTO else None)
+        return asked if due + RECOVERY <= iterations else None
+
+    def _target(self, iterations: int) -> int | None:
+        """Return the number that densification aims at: that of the budget, if it is one; twice that before pruning."""
         requested = self._gaussians if isinstance(self._gaussians, int) else None
-        return requested if requested is None or self.options.prune_psnr is None else GROWN_PER_KEPT * requested
+        return requested if requested is None or self._prune_psnr(iterations) is None else GROWN_PER_KEPT * requested
 
     def restore(self, state: State) -> SplatModel:
         stored = state.of_model()
@@ -165,10 +171,10 @@ class SplatMethod(Method):
             extent=extent,
             iterations=iterations,
             views=views,
-            target=self._target,
+            target=self._target(iterations),
             seed=self.seed,
             requested=self._gaussians,
-            prune_psnr=options.prune_psnr or (PRUNE_PSNR if self._gaussians == AUTO else None),
+            prune_psnr=self._prune_psnr(iterations),
             smoothing_filter=options.smoothing_filter,
             means_rate_factor=options.means_rate_factor,
             supersampling_from=options.supersampling_from,

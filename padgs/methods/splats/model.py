@@ -73,7 +73,7 @@ class SplatModel:
             rendered_opacities=self._rendered_opacities,
             seed=seed,
         )
-        self.pruning = PruningStep(self.densifier.options, iterations, requested=requested, prune_psnr=prune_psnr)
+        self.pruning = PruningStep(self.densifier.options, requested=requested, prune_psnr=prune_psnr)
         self._filter = SmoothingFilter(smoothing_filter, cameras_of(views)) if smoothing_filter > 0 else None
         self._follow()
 

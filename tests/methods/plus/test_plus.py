@@ -89,26 +89,24 @@ def test_the_most_important_gaussians_are_kept():
     assert kept.sum() == len(chosen) and found.change[kept].min() >= found.change[~kept].max()
 
 
-@pytest.mark.parametrize("iterations", [100, 6])
-def test_a_budget_of_gaussians_is_enforced_at_the_end(iterations):
+@pytest.mark.parametrize(("iterations", "least"), [(200, 150), (100, 120), (6, 120)])
+def test_a_budget_of_gaussians_is_met(iterations, least):
     for record in PlusMethod(OPTIONS).fit(tiny_scene(), Budget(iterations, gaussians=150)):
         last = record.counts["gaussians"]
-    assert last == 150
+    assert least <= last <= 150
 
 
-@pytest.mark.parametrize(
-    ("iterations", "gaussians", "chosen"), [(100, 150, [31]), (100, "auto", [31]), (200, None, [])]
-)
-def test_a_run_stopped_before_pruning_prunes_at_once_only_for_a_budget(iterations, gaussians, chosen):
-    budget, whole, again = Budget(iterations, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+@pytest.mark.parametrize(("gaussians", "chosen"), [(150, [61]), ("auto", [61]), (None, [])])
+def test_a_run_stopped_before_pruning_prunes_at_once_only_for_a_budget(gaussians, chosen):
+    budget, whole, again = Budget(200, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
     counts, events = [], []
     for record in whole.fit(tiny_scene(), budget):
         counts.append(record.counts["gaussians"])
         events += [record.iteration for event in record.events if "least important" in event]
-        if record.iteration == 30:
+        if record.iteration == 60:
             assert whole.request_stop("asked")
             again.load_state(whole.state())
-    assert events == chosen and (counts[30] == counts[-1] < counts[29]) == bool(chosen)
+    assert events == chosen and (counts[60] == counts[-1] < counts[59]) == bool(chosen)
     assert gaussians != 150 or counts[-1] == 150
     list(again.fit(tiny_scene(), budget))
     assert_same_but_time(again.state(), whole.state())
@@ -119,7 +117,7 @@ def test_a_tight_budget_leaves_capacity_for_sky_and_densification():
     points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
     scene = replace(tiny, points=points, point_colors=tiny.point_colors[:1].expand(400, 3))
     method = PlusMethod(OPTIONS)
-    method.fit(scene, Budget(64, gaussians=100))
+    method.fit(scene, Budget(200, gaussians=100))
     far = method.model.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
     assert (~far).sum() == math.ceil(200 / 1.5) and far.sum() > 20
     assert method.start < 200

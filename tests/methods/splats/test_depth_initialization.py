@@ -140,11 +140,12 @@ def test_initial_number_of_gaussians():
 def test_a_budget_limits_the_number_of_filled_points(monkeypatch):
     sought = []
     monkeypatch.setattr(method_module, "fill_sparse_cloud", lambda scene, count, **_: sought.append(count) or scene)
-    for budget in (None, 150):
-        list(PlusMethod(PlusOptions(sky_per_point=0.5)).fit(dome(300), Budget(16, gaussians=budget)))
+    for budget, iterations in ((None, 200), (150, 200), (150, 16)):
+        PlusMethod(PlusOptions(sky_per_point=0.5)).fit(dome(300), Budget(iterations, gaussians=budget))
     assert sought == [
         round(PlusOptions().depth_init_per_pixel * solid_angle_pixels(dome(8).train[0])),
         math.ceil(2 * 150 / 1.5),
+        math.ceil(150 / 1.5),  # so short a run prunes nothing
     ]
 
 

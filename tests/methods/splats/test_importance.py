@@ -10,7 +10,6 @@ from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.importance import (
     MIN_KEPT_SHARE,
     Importance,
-    PruningStep,
     count_for_psnr,
     importance_scores,
     most_important,
@@ -37,17 +36,6 @@ def test_rows_are_removed_until_their_changes_add_up_to_the_psnr(psnr, count):
 
 def test_a_tenth_stays_even_if_all_rows_replace_each_other():
     assert count_for_psnr(scored(*[0.0] * 1000), 44.0) == MIN_KEPT_SHARE * 1000
-
-
-@pytest.mark.parametrize("every", [1, 10, 100])
-@pytest.mark.parametrize(
-    ("following", "requested", "due"), [(99, None, 0), (100, None, 1), (99, "auto", 1), (1, 50, 1)]
-)
-def test_nothing_is_pruned_that_training_cannot_recover(every, following, requested, due):
-    options = DensificationOptions(densify_until=4 * every + 1, densify_every=every)
-    step = PruningStep(options, 5 * every + following, requested=requested, prune_psnr=44.0)
-    assert step.is_ahead(5 * every - 1) == due
-    assert [step.is_due(iteration) for iteration in (5 * every - 1, 5 * every)] == [False, due]
 
 
 def test_all_pixels_of_a_perspective_view_weigh_the_same():

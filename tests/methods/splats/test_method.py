@@ -17,7 +17,7 @@ from padgs.training.options import Budget
 def test_budget_auto_prunes_once_after_densification(name):
     method = lookup(METHODS, name, "method")()
     counts, events = [], []
-    for record in method.fit(tiny_scene(), Budget(120, gaussians="auto")):
+    for record in method.fit(tiny_scene(), Budget(300, gaussians="auto")):
         counts.append(record.counts["gaussians"])
         events += [(record.iteration, event) for event in record.events if "least important" in event]
     ((iteration, event),) = events
@@ -84,3 +84,13 @@ def test_every_explicit_method_takes_the_options_of_padgs_plus(name):
     assert model.splats.sh_rest.shape[1] == 8
     rates = {group.name: group.learning_rate(0) for group in model.groups()}
     assert rates["means"] == pytest.approx(2 * 1.6e-4 * method.options.extent_of(scene))
+
+
+@pytest.mark.parametrize("gaussians", [None, 100, "auto"])
+@pytest.mark.parametrize("name", ["padgs_plus", "spags_tuned"])
+def test_nothing_is_pruned_that_training_cannot_recover(name, gaussians):
+    method = make_method(name, f"budget.gaussians={gaussians or 'null'}")
+    for iterations in (60, 150, 170, 181, 182, 199, 200, 299, 300, 1000):
+        method.fit(tiny_scene(), Budget(iterations, gaussians=gaussians))
+        step = method.model.pruning
+        assert step.is_ahead(0) == (step.due + 100 <= iterations) == step.is_due(step.due), iterations
