@@ -18,9 +18,7 @@ from padgs.training.targets import even_weight, image_of
 
 GROWN_PER_KEPT = 2  # Gaussians before the pruning step per Gaussian after it, about
 MIN_KEPT_SHARE = 0.1  # of the rows stays in one pruning step, whatever the scores
-RECOVERY = (
-    100  # iterations that must follow the step: at 256x128 `bedroom` loses 15 dB with 22, 2.2 with 55, 0.3 with 110
-)
+RECOVERY = 100  # iterations after the step, or too much is lost: `bedroom` 15 dB with 22, 2.2 with 55, 0.3 with 110
 
 
 @dataclass(frozen=True)
