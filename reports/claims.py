@@ -16,7 +16,7 @@ from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
 from padgs.reports.published import DATASETS, NEVER_SEEN, TUNED_ON, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
-from padgs.reports.significance import CONFIDENCE, paired_test
+from padgs.reports.significance import CONFIDENCE, differ, failures, mean_cell, paired_test
 from padgs.reports.table import MISSING
 from padgs.reports.writers import Page, rendered
 from padgs.results import higher_is_better
@@ -121,17 +121,19 @@ def load() -> list[Claim]:
 
 def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
     """Test whether the mean advantages differ from zero: paired t-tests on the scenes' means over seeds, with Holm's
-    correction for all claims.
+    correction for all tested claims of the paper, and apart for all of this project.
 
     A claim holds (is not reproduced) if the mean is significantly positive (negative), and every scene is likewise.
     """
     found = [Evidence(claim, measured(claim, run_set)) for claim in claims]
     found = [replace(one, p=paired_test([*one.tested["advantage"]])[0]) if one.interval else one for one in found]
-    tested = sorted((one.p, index) for index, one in enumerate(found) if not math.isnan(one.p))
-    adjusted = 0.0
-    for rank, (p, index) in enumerate(tested):
-        adjusted = max(adjusted, min(1.0, (len(tested) - rank) * p))
-        found[index] = replace(found[index], p=adjusted)
+    for own in (False, True):
+        every = enumerate(found)
+        tested = sorted((one.p, at) for at, one in every if (one.claim.source == OURS) is own and not math.isnan(one.p))
+        adjusted = 0.0
+        for rank, (p, at) in enumerate(tested):
+            adjusted = max(adjusted, min(1.0, (len(tested) - rank) * p))
+            found[at] = replace(found[at], p=adjusted)
     return [replace(one, verdict=_verdict(one)) for one in found]
 
 
@@ -141,12 +143,13 @@ def _verdict(evidence: Evidence) -> str:
     advantages = evidence.tested["advantage"]
     if len(advantages) < 2:
         return UNDECIDED
-    if (advantages > 0).any() and (advantages < 0).any():
+    beyond_seeds = advantages[evidence.tested["differs"]]
+    if (beyond_seeds > 0).any() and (beyond_seeds < 0).any():
         return MIXED
-    if not evidence.p < 1 - CONFIDENCE:
+    if not evidence.p < 1 - CONFIDENCE or ((advantages > 0) != (advantages.mean() > 0)).any():
         return UNDECIDED
     if advantages.mean() > 0:
-        return HOLDS
+        return UNDECIDED if evidence.scenes["failed"].any() else HOLDS
     as_published = evidence.claim.source == OURS or evidence.tested["as published"].all()
     sizes = evidence.tested.sort_values("width")["size"].unique()
     return FAILS if as_published else f"{NOT_REPRODUCED} at {' and '.join(sizes)}"
@@ -212,6 +215,7 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             row |= {"scene": found["place"].label, "seen": found["place"].seen, "size": size, "length": length}
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)
+            row["failed"] = failures(ours.select(runs.loc[runs["place"] == found["place"]]))
             rank = itemgetter("tested", "width", "iterations")
             best[found["place"]] = max(row, best.get(found["place"], row), key=rank)
     rows = DataFrame([best[place] for place in sorted(best, key=lambda place: place.rank)])
@@ -233,7 +237,9 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, 
     rival, advantage = min(advantages.items(), key=itemgetter(1))
     seeds = len(first), len(rivals[rival])
     tested = min(seeds) >= LEAST_SEEDS and math.isfinite(advantage)  # inf: an exact render
-    return {"rival": rival, "advantage": advantage, "tested": tested, "seeds": f"{seeds[0]}, {seeds[1]}"}
+    differs = tested and differ(mean_cell([*first]), mean_cell([*rivals[rival]]), claim.measure.column)
+    found = {"rival": rival, "advantage": advantage, "differs": differs, "tested": tested}
+    return {**found, "seeds": f"{seeds[0]}, {seeds[1]}"}
 
 
 def _numbers(claim: Claim, runs: DataFrame) -> Any:

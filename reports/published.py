@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ SEEN = {  # beginning of the fingerprint of a capture, or name of a generated sc
     for known in scenes.values()
     for data in known
 }
-OUTDOOR_WORDS = ("outdoor", "garden")  # in names of scenes outside the data sets that belong to Table 2
+OUTDOOR = {"outdoor", "garden", "plaza", "courtyard", "park", "street"}  # words of names; all others are for Table 1
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,12 @@ class Place:
 
     @property
     def outdoor(self) -> bool:
-        """True if the scene belongs beside the outdoor scenes of Ricoh360."""
-        return self.dataset == "ricoh360" or any(word in self.scene for word in OUTDOOR_WORDS)
+        """True if the scene belongs beside the outdoor scenes of Ricoh360.
+
+        >>> Place("", "city_park-2").outdoor, Place("", "parking").outdoor
+        (True, False)
+        """
+        return self.dataset == "ricoh360" or not OUTDOOR.isdisjoint(re.split(r"[\W_]+", self.scene.lower()))
 
     @property
     def label(self) -> str:

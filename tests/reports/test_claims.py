@@ -80,6 +80,7 @@ def test_verdicts():
     as_published = against(*WORSE, width=1920, height=960, iterations=30_000)
     assert verdict(as_published) == FAILS, "only at the paper's size and length"
     assert verdict(against(WORSE[0], BETTER[0])) == MIXED and verdict(against([0.1, 0.1], [9, 9])) == UNDECIDED
+    assert verdict(against([-2, 1.8], BETTER[0])) == UNDECIDED, "scenes disagree within the noise of seeds"
     assert verdict([]) == UNMEASURED == verdict(runs([1, 2]))
     assert verdict(against(*BETTER), scenes="outdoor") == UNMEASURED
 
@@ -105,6 +106,24 @@ def test_all_claims_share_the_level_by_the_method_of_holm():
     (single,) = judge([one], run_set(made))
     assert single.verdict == HOLDS and alone.p == pytest.approx(6 * single.p) and alone.verdict == UNDECIDED
     assert math.isnan(rest[0].p), "a claim that was not measured costs nothing"
+    ours, *theirs = judge([replace(one, source=OURS), *[one] * 5], run_set(made))
+    assert ours.p == pytest.approx(single.p) and theirs[0].p == pytest.approx(5 * single.p), "apart from the paper's"
+
+
+def test_a_claim_does_not_hold_where_runs_of_its_method_failed():
+    made = against([1, 1.1, 1], [2, 2.1, 2], [1.5, 1.4, 1.5], seeds=3)
+    assert verdict(made) == HOLDS
+    for lost in (1, 2):  # beside runs that go on, and a length that no run reached
+        failed = [
+            replace(run, status="nan", scores={})
+            for run in against([0] * lost, iterations=1500 if lost == 1 else 9000)
+            if run.preset == "padgs"
+        ]
+        kept = [run for run in made if run.run not in {one.run for one in failed}]
+        found = evidence([*kept, *failed])
+        assert found.verdict == UNDECIDED and list(found.scenes["failed"]) == ["", "", "nan"]
+        of_rivals = [replace(run, preset="omnigs", run=f"{run.run}o") for run in failed]
+        assert verdict([*made, *of_rivals]) == HOLDS, "failures of rivals do not make it wrong"
 
 
 def test_the_best_rival_counts_and_a_required_one_must_be_there():
@@ -130,7 +149,7 @@ def test_only_comparable_runs_count():
     assert verdict([*made, *long]) == NOT_REPRODUCED, "the longest"
     assert verdict([*made, *(run for run in long if run.seed == 0)]) == HOLDS, "the longest with two seeds"
     failed = [replace(run, status="oom", scores={}) if run.preset == "padgs" else run for run in long]
-    assert verdict([*made, *failed]) == HOLDS, "a length that only one side reached"
+    assert list(evidence([*made, *failed]).tested["length"].unique()) == ["1500 iterations"], "only one side reached it"
     assert verdict([*made, *against(*WORSE, width=256, height=128, iterations=9000)]) == HOLDS, "the widest"
     assert verdict([*made, *(of_experiment("length", 9, seed=seed, iterations=9000) for seed in range(3))]) == HOLDS
 
@@ -181,7 +200,7 @@ def test_the_page_has_the_answer_first_then_claims_then_scenes():
         assert {number: text for number, text, *_ in tables[0]} == claims
         assert [number for number, *_ in tables[1]] == [*claims]
     answer, rest = findings(run_set(made)).text.split("## Evidence")
-    assert f"| 10 | {claims['10']} | Sec. 4.5 | {NOT_REPRODUCED} |" in answer
+    assert f"| 10 | {claims['10']} | padgs | {FAILS} |" in answer
     assert "| 10 | PSNR | -1.52 | -2.77 to -0.27 | 0.035 | 0 of 3 | – |" in rest
     shown = "| 10 | 512x256, 1500 iterations | synthetic-cave -2.05 (OmniGS, corrected, 2/2); synthetic-den -1.45"
     assert shown in rest.split("## Scenes")[1]
