@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Format, Mask, Split, check_range, name_place, show
+from padgs.cli.errors import Format, Images, Mask, Split, check_range, name_place, show
 
 
 def split(
@@ -13,6 +13,7 @@ def split(
     to: Annotated[str, typer.Option(help="folder to write; default: SOURCE-blocks")] = "",
     format: Format = "auto",
     mask: Mask = "auto",
+    images: Images = "",
     split: Split = "auto",
 ) -> None:
     """Divide a data set into blocks of cameras that see the same points; their images are links to those of SOURCE."""
@@ -26,7 +27,9 @@ def split(
     check_range(2, 10_000, blocks=blocks)
     destination = Path(to or f"{os.path.abspath(source)}-blocks")  # also of "."
     with name_place(destination):
-        lines = write(Path(source), destination, blocks, format, DataOptions(mask=mask, split=split))
+        lines = write(
+            Path(source), destination, blocks, format, DataOptions(mask=mask, split=split, images=images or None)
+        )
     for line in lines:
         show(line)
     names = ",".join(line.partition(": ")[0] for line in lines)

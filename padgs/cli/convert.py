@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Depth, Mask, Split, check_range, show
+from padgs.cli.errors import Depth, Images, Mask, Split, check_range, show
 from padgs.cli.prepare import CameraHeight, Gps, Metres
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
@@ -20,6 +20,7 @@ def convert(
     points: Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of starting points")] = "auto",
     mask: Mask = "auto",
     depth: Depth = "auto",
+    images: Images = "",
     split: Split = "auto",
     metres: Metres = None,
     camera_height: CameraHeight = None,
@@ -41,7 +42,9 @@ def convert(
             Path(destination),
             to,
             format=format,
-            options=DataOptions(width=width or None, points=points, mask=mask, depth=depth, split=split),
+            options=DataOptions(
+                width=width or None, points=points, mask=mask, depth=depth, split=split, images=images or None
+            ),
             known=KnownLength(metres, camera_height, gps),
             progress=lambda done, total: status.update(f"image {done} of {total}"),
         )

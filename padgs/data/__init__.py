@@ -9,7 +9,7 @@ from pathlib import Path
 
 from padgs.checks import lookup
 from padgs.data.assemble import assemble, found_images
-from padgs.data.capture import Capture, DataError, DataOptions
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions
 from padgs.data.cloud import NO_FILE, read_cloud
 from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
@@ -79,7 +79,12 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         notes = (f"format: {format}, read by {package.name} {package.version}",) if package else ()
     if format == "synthetic":
         raise DataError(f"{path}: synthetic scenes are made, not read from a folder; give another format, or auto")
-    capture = lookup(LOADERS, format, "data.format")(path, options)
+    try:
+        capture = lookup(LOADERS, format, "data.format")(path, options)
+    except DataError as error:
+        if not any(OTHERS in note for note in notes):
+            raise
+        raise DataError(f"{error}; {notes[0]}") from error
     if not isinstance(capture, Capture):
         raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask

@@ -8,7 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, first_of, listed, view_name
+import torch
+from torch import Tensor
+
+from padgs.data.camera_paths import centers
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, Frame, first_of, listed, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
@@ -19,6 +23,7 @@ from padgs.data.store import ImageStore, StoredImage, cache_root
 from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
+MAX_GAP = 1e4  # between cameras and points, times the median distances within both
 MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 HIDDEN = (".", "__MACOSX", "@eaDir", "@Recycle", "#recycle")  # beginnings of names; network drives keep previews there
@@ -42,7 +47,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         raise DataError(
             f"all {len(frames)} images of {capture.folder} are of other cameras ({frames[0].name}), which can be used "
             "beside panoramas (EQUIRECTANGULAR) only: reconstruct from the panoramas themselves (`padgs prepare`), or "
-            "give the sparse_equirectangular model"
+            "give the sparse_equirectangular model" + "".join(f"; {note}" for note in capture.notes if OTHERS in note)
         )
     refuse_clashes(names)
     _refuse_missing(capture)
@@ -75,6 +80,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     if min(split.train) >= panoramas:
         raise DataError("the train split holds no panorama, only photographs; name a panorama, or set data.split=every")
     points, colors, cloud_notes = initial_cloud(capture, options.points)
+    _refuse_other_world(capture, points)
     folder, cache_notes = disk_cache(options, 3 * sum(width * height for width, height in sizes))
     store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device, folder)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
@@ -103,6 +109,21 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     digest.update(scene.points.numpy().tobytes())
     digest.update(colors.numpy().tobytes())
     return replace(scene, fingerprint=digest.hexdigest())
+
+
+def _refuse_other_world(capture: Capture, points: Tensor) -> None:
+    """Refuse points that cannot belong to the cameras, such as in local beside map coordinates."""
+    positions = centers(torch.stack([frame.cam_from_world for frame in capture.frames]))
+    (camera, reach), (point, spread) = (
+        (middle, (of - middle).norm(dim=1).median()) for of in (positions, points) for middle in [of.median(0).values]
+    )
+    if reach > 0 and (gap := (point - camera).norm()) > MAX_GAP * (reach + spread):
+        places = (f"({', '.join(f'{number:.6g}' for number in middle.tolist())})" for middle in (camera, point))
+        raise DataError(
+            "the cameras are around {}, the points around {}: ".format(*places)
+            + f"{gap:.3g} apart, {gap / (reach + spread):.2g} times as much as they spread, so not in one world; "
+            "export both in the same coordinates, or set data.points=random"
+        )
 
 
 def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]:

@@ -20,6 +20,8 @@ from padgs.checks import unknown
 from padgs.geometry.camera import Camera
 
 Progress = Callable[[int, int], None]  # called with (done, total)
+FARTHEST = 1e15  # world units from the origin, the limit of renderers (`padgs.render.contract`)
+OTHERS = "also present, not used"  # words of a note about files of other formats
 
 
 def silent(done: int, total: int) -> None:

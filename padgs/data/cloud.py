@@ -1,5 +1,6 @@
 """Point clouds: PLY files through plyfile, and the cloud from which training starts."""
 
+import re
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import Capture, Cloud, DataError, refuse_special
+from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, refuse_special
 from padgs.files import atomic_path
 
 CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, after one of the prefixes; any case
@@ -86,11 +87,13 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
 
     refuse_special(path)
     try:
+        with path.open("rb") as file:
+            is_text = b"format ascii" in file.read(100)
         try:
-            data = PlyData.read(str(path))  # memory-mapped; reading 500 000 Gaussians row by row takes minutes
-        except UnicodeDecodeError:  # a comment; plyfile reads ASCII only
-            header, end, rest = path.read_bytes().partition(b"end_header")
-            data = PlyData.read(BytesIO(header.decode("ascii", "replace").encode("ascii", "replace") + end + rest))
+            # Memory-mapped if binary: reading 500 000 Gaussians row by row takes minutes.
+            data = PlyData.read(_plain_text(path) if is_text else str(path))
+        except UnicodeDecodeError:
+            data = PlyData.read(_plain_text(path))
         vertex = data["vertex"]
     except FileNotFoundError as error:
         remedy = "set data.points to a PLY, LAS, LAZ or E57 file, or to random"
@@ -101,6 +104,17 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
         why = error or type(error).__name__
         raise DataError(f"{path} is not a readable PLY file ({why}); export it again as PLY, LAS or E57") from error
     return vertex, {prop.name for prop in vertex.properties if not isinstance(prop, PlyListProperty)}
+
+
+def _plain_text(path: Path) -> BytesIO:
+    """Return a PLY file as plyfile reads it: an ASCII header without a byte-order mark, and x, y, z as doubles, since
+    text holds more digits of map coordinates than a float.
+    """
+    header, end, rest = path.read_bytes().removeprefix(b"\xef\xbb\xbf").partition(b"end_header")
+    header = header.decode("ascii", "replace").encode("ascii", "replace")
+    if b"format ascii" in header:
+        header = re.sub(rb"property +float(?:32)? +([xyz])\b", rb"property double \1", header)
+    return BytesIO(header + end + rest)
 
 
 def write_ply(path: Path, cloud: Cloud) -> None:
@@ -140,8 +154,9 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
     if not len(points):
         why = "training starts from a point cloud"
         raise DataError(f"{where} holds no points; {why}: set data.points to a PLY file, or to random")
-    if bad := (~points.float().isfinite().all(1)).sum().item():
-        raise DataError(f"{bad} of {len(points)} points of {where} are not finite; remove them from the cloud")
+    if bad := (~(points.abs() <= FARTHEST).all(1)).sum().item():
+        rule = f"not finite, or farther than {FARTHEST:g} from the origin"
+        raise DataError(f"{bad} of {len(points)} points of {where} are {rule}; remove them from the cloud")
     if colors is None or not colors.any():  # black is what scanners without a camera write
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
         notes = (*notes, GREY_POINTS)

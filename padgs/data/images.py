@@ -21,7 +21,7 @@ from padgs.data import image_metadata
 from padgs.data.capture import DataError, listed, refuse_special
 from padgs.files import DAMAGE, ImageError, open_image
 
-EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+EXTENSIONS = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp")
 _COLOUR = ("RGB", "RGBA", "RGBa", "RGBX", "P", "PA", "YCbCr")
 _GREY = ("1", "L", "LA", "La")
 _ALPHA = ("RGBA", "RGBa", "LA", "La", "PA")
@@ -30,6 +30,8 @@ FILLING = b"\x55" * 2048  # decodes to a few pixels of a JPEG scan
 # Detection of dual-fisheye images: radii are relative to half the side of each circle's square.
 FISHEYE_ROWS = 128  # sampled
 OUTSIDE, RIM = 1.06, (0.7, 0.9)
+LABELS = 32  # a mask without a value as large, but with several, holds the numbers of labels
+COLOURED = 64  # difference of the channels of a coloured pixel of a mask
 BLACK = 24  # largest pixel value that counts as black
 MIN_BLACK_OUTSIDE, MAX_BLACK_RIM = 0.98, 0.5  # shares of the pixels
 
@@ -143,6 +145,7 @@ def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
         transparent = _is_transparent(image)
         convert = image_metadata.srgb_conversion(image, data, path) if mode == "RGB" else None
         crop, stored = image_metadata.crop_of(image, path), _eight_bit(image).convert(mode)
+        is_coloured = mode == "L" and image.mode in _COLOUR and _is_coloured(image)
         cut = _misses_pixels(image, data, np.asarray(stored))
         pixels = np.array(stored if convert is None else convert(stored))
     if cut:
@@ -150,13 +153,24 @@ def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
     if transparent:
         remedy = "say what to ignore in a mask file (data.mask)" if mode == "RGB" else "paint what to ignore black (0)"
         raise DataError(f"{path} has transparent pixels; save it without alpha, and {remedy}")
+    if is_coloured:
+        rule = "a mask is white (use) and black (ignore), or the other way with data.mask=inverted"
+        raise DataError(f"{path} is a mask in colours; {rule}: convert it")
     if crop is not None:
         rows = (crop.top, crop.full_height - crop.top - crop.height)
         columns = (crop.left, crop.full_width - crop.left - crop.width)
         pixels = np.pad(pixels, (rows, columns, (0, 0))[: pixels.ndim])
-    if mode == "RGB":
-        return pixels
-    return pixels[..., None] * np.uint8(255 if pixels.max() == 1 else 1)  # masks of 0 and 1
+    return pixels if mode == "RGB" else _two_valued(pixels, path)[..., None]
+
+
+def _two_valued(mask: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
+    """Return a mask with 255 for the only value that it has besides 0, such as 1; a DataError for labels 0, 1, 2."""
+    values = np.bincount(mask.ravel(), minlength=256)[1:].nonzero()[0] + 1
+    if len(values) > 1 and values[-1] < LABELS:
+        rule = "in a mask 255 means use, 0 means ignore"
+        raise DataError(f"{path} has no value above {values[-1]}, as images of labels have; {rule}: convert it")
+    is_mark = len(values) == 1 and (values[0] == 1 or mask.min() == 0)  # else one weight for all
+    return np.where(mask > 0, np.uint8(255), np.uint8(0)) if is_mark else mask
 
 
 def _is_transparent(image: Image.Image) -> bool:
@@ -175,7 +189,15 @@ def _eight_bit(image: Image.Image) -> Image.Image:
         return image.convert("RGBA")
     if not image.mode.startswith("I"):
         return image
-    return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))
+    values = np.asarray(image).astype(np.int64)
+    if values.max(initial=0) > 255:  # else it holds 8 bits
+        values >>= 8
+    return Image.fromarray(values.clip(0, 255).astype(np.uint8))
+
+
+def _is_coloured(image: Image.Image) -> bool:
+    """Return whether a mask has colours, whose brightness means nothing; JPEG leaves a few faint ones."""
+    return bool((np.ptp(np.asarray(image.convert("RGB")), axis=-1) > COLOURED).mean() > 1e-3)
 
 
 def read_bytes(path: Path, *, empty: bool = False) -> bytes:
@@ -187,6 +209,8 @@ def read_bytes(path: Path, *, empty: bool = False) -> bytes:
         raise DataError(f"{path} does not exist") from error
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror}); check its permissions") from error
+    if data.startswith(b"version https://git-lfs"):
+        raise DataError(f"{path} is a pointer of Git LFS, not the file; get it with `git lfs pull`")
     if not data and not empty:
         raise DataError(f"{path} is empty (0 bytes); copy it again or remove it")
     return data

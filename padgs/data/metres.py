@@ -187,7 +187,7 @@ def gps_of(image: Path) -> tuple[float, float, float] | None:
     try:
         angles = [
             sum(float(part) / 60**k for k, part in enumerate(tags[value]))
-            * (-1 if str(tags[side])[:1] in {"S", "W"} else 1)
+            * (-1 if str(tags[side])[:1].upper() in {"S", "W"} else 1)
             for value, side in (
                 (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef),
                 (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef),

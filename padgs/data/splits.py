@@ -1,11 +1,12 @@
 """Split of the views into training and test views: by list files, or every k-th view."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from unicodedata import normalize
 
-from padgs.data.capture import DataError, listed
+from padgs.data.capture import DataError, first_of, listed
 from padgs.data.images import EXTENSIONS, read_bytes
 
 MAX_NAME_BYTES = 255  # of a file name
@@ -40,11 +41,14 @@ def split_frames(
     """
     if mode == "all":
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
+    files = {side: file for side, name in LISTS.items() if (file := first_of(folder, (name,)))}
     lists = dict(stated or {}) if mode == "auto" else {}
     origin = "the split of the data set"
+    if lists and files:
+        origin += f"; {' and '.join(file.name for file in files.values())} not used: data.split=files uses them"
     if not lists and mode != "every":
-        lists = {side: read_list(folder / file) for side, file in LISTS.items() if (folder / file).is_file()}
-        origin = " and ".join(LISTS[side] for side in lists)
+        lists = {side: read_list(file) for side, file in files.items()}
+        origin = " and ".join(file.name for file in files.values())
     if not lists:
         if mode == "files":
             raise DataError(f"data.split=files, but {folder} holds no train.txt, no test.txt; write them or use every")
@@ -75,9 +79,11 @@ def read_lines(path: Path, errors: str = "strict") -> list[str]:
     """Read the lines of a text file in UTF-8, or UTF-16 with its mark; `errors` is that of `bytes.decode`."""
     data = read_bytes(path, empty=True)
     try:
-        return data.decode("utf-16" if data.startswith(UTF_16) else "utf-8-sig", errors).splitlines()
+        text = data.decode("utf-16" if data.startswith(UTF_16) else "utf-8-sig", errors)
     except UnicodeDecodeError as error:
         raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as UTF-8") from error
+    # Not str.splitlines, which also ends lines at characters that names may have.
+    return re.split(r"\r\n?|\n", text.removesuffix("\n")) if text else []
 
 
 def is_inside(name: str) -> bool:

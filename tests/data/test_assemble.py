@@ -272,3 +272,26 @@ def test_images_that_the_disk_cache_holds_do_not_count_against_it(tmp_path, monk
     (tmp_path / "cache" / "a").write_bytes(bytes(400))
     free = 600
     assert disk_cache(options, 400)[0] == tmp_path / "cache"
+
+
+def test_points_of_another_world_are_refused(world: World, tmp_path: Path) -> None:
+    utm = np.array([691_000.0, 5_334_000.0, 520.0])
+    for moved in ("points", "centers"):
+        folder = tmp_path / moved
+        write_colmap_text(replace(world, **{moved: getattr(world, moved) + utm}), folder)
+        with pytest.raises(
+            DataError, match=r"the cameras are around \(.*\), the points around \(.*one world; .*random"
+        ):
+            load(folder)
+    assert load(folder, points="random").points.abs().max() < 1e5
+
+
+def test_pointers_of_git_lfs_are_named(folder: Path) -> None:
+    for name in ("images/pano_00.png", "sparse/0/cameras.txt"):
+        kept = (folder / name).read_bytes()
+        (folder / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+        with pytest.raises(
+            DataError, match=rf"{Path(name).name} is a pointer of Git LFS, not the file; .*git lfs pull"
+        ):
+            load(folder)
+        (folder / name).write_bytes(kept)

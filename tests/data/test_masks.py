@@ -1,5 +1,6 @@
 """Masks: files, rules, weights and errors."""
 
+import json
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.fixtures import World, write_colmap_text
+from support.fixtures import World, write_colmap_text, write_transforms
 
 from padgs.data import DataError, load
 from padgs.data.masks import row_weights, write_masks
@@ -176,3 +177,49 @@ def test_unusable_masks(folder: Path) -> None:
     (folder / "empty").mkdir()
     with pytest.raises(DataError, match="holds no mask named like an image"):
         load(folder, mask="empty")
+
+
+@pytest.mark.parametrize(
+    ("values", "mode"),
+    [((0, 1), "L"), ((0, 2), "L"), ((0, 128), "L"), ((0, 1), "I;16"), ((0, 255), "I;16"), ((0, 65535), "I;16")],
+)
+def test_the_only_value_besides_0_means_use_or_ignore(values: tuple[int, int], mode: str, folder: Path) -> None:
+    pixels = np.full((32, 64), values[1], np.uint16 if mode == "I;16" else np.uint8)
+    pixels[:16] = 0
+    Image.fromarray(pixels).save(folder / "mask.png")
+    marked = torch.zeros(32, 64)
+    marked[16:] = 1
+    torch.testing.assert_close(load(folder).train[0].mask(), marked)
+    torch.testing.assert_close(load(folder, mask="inverted").train[0].mask(), 1 - marked)
+
+
+@pytest.mark.parametrize("spec", ["auto", "inverted"])
+def test_labels_and_colours_are_no_masks(spec: str, folder: Path) -> None:
+    _mask(folder / "mask.png")
+    labels = np.array(Image.open(folder / "mask.png")) // 255 + 1
+    labels[:4] = 0
+    Image.fromarray(labels).save(folder / "mask.png")
+    with pytest.raises(DataError, match=r"mask.png has no value above 2, as images of labels have; .* convert it"):
+        load(folder, mask=spec)
+    red = np.full((32, 64, 3), 255, np.uint8)
+    red[24:] = (255, 0, 0)
+    Image.fromarray(red).save(folder / "mask.png")
+    with pytest.raises(DataError, match=r"mask.png is a mask in colours; a mask is white \(use\) and black"):
+        load(folder, mask=spec)
+    Image.fromarray(red).convert("L").convert("RGB").save(folder / "mask.jpg", quality=40)  # grey after JPEG
+    (folder / "mask.png").unlink()
+    assert load(folder).train[0].mask() is not None
+
+
+def test_masks_of_whole_images_fit_reduced_ones(world: World, tmp_path: Path) -> None:
+    write_transforms(world, tmp_path)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "images_2/images").mkdir(parents=True)
+    for frame in data["frames"]:
+        name = Path(frame["file_path"])
+        Image.open(tmp_path / name).resize((32, 16)).save(tmp_path / "images_2" / "images" / name.name)
+        frame["mask_path"] = f"masks/{name.name}"
+        _mask(tmp_path / frame["mask_path"])
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    mask = load(tmp_path, images="images_2").train[0].mask()
+    assert mask is not None and mask.shape == (16, 32) and mask[:12].eq(1).all() and mask[12:].eq(0).all()

@@ -156,3 +156,18 @@ def test_huge_counts_do_not_allocate_memory(tmp_path: Path) -> None:
     path.write_bytes(header.encode() + b"1234")
     with pytest.raises(DataError, match="not a readable PLY file"):
         read_ply(path)
+
+
+def test_text_keeps_the_digits_of_map_coordinates(tmp_path: Path) -> None:
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float32 y\nproperty float z\nend_header\n"
+    )
+    (tmp_path / "map.ply").write_text("\ufeff" + header + "691000.123 5399999.985 520.25\n0 1 2\n")
+    assert read_ply(tmp_path / "map.ply").points.tolist() == [[691000.123, 5399999.985, 520.25], [0, 1, 2]]
+
+
+def test_points_beyond_what_can_be_rendered_are_refused(tmp_path: Path) -> None:
+    for far in (1e16, float("nan"), float("inf"), -1e300):
+        cloud = Cloud(torch.tensor([[0.0, 0, 1], [0, far, 0]], dtype=torch.float64), None)
+        with pytest.raises(DataError, match=r"1 of 2 points .* are not finite, or farther than 1e\+15 from the origin"):
+            initial_cloud(Capture("transforms", tmp_path, tmp_path, (), cloud), "auto")

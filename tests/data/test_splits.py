@@ -96,3 +96,19 @@ def test_list_files_must_be_utf8(tmp_path: Path) -> None:
     (tmp_path / "train.txt").write_bytes(b"\x81\xfe\x00\xff")
     with pytest.raises(DataError, match="train.txt cannot be read as UTF-8 text"):
         read_list(tmp_path / "train.txt")
+
+
+def test_lists_are_found_in_any_case_and_said_to_be_unused_beside_a_stated_split(tmp_path: Path) -> None:
+    (tmp_path / "Test.txt").write_text("b\n")
+    assert split_frames(NAMES, tmp_path).test == (1,)
+    stated = split_frames(NAMES, tmp_path, stated={"test": ("c.jpg",)})
+    assert stated.test == (2,) and stated.notes[0].endswith("Test.txt not used: data.split=files uses them")
+    assert split_frames(NAMES, tmp_path, stated={"test": ("c.jpg",)}, mode="files").test == (1,)
+
+
+def test_names_with_separators_of_unicode_are_one_line(tmp_path: Path) -> None:
+    for name in ("a\u2028b.jpg", "a\x85b.jpg", "a\x0bb.jpg"):
+        (tmp_path / "test.txt").write_text(f"{name}\r\n", encoding="utf-8")
+        assert read_list(tmp_path / "test.txt") == (name,)
+    (tmp_path / "test.txt").write_text("")
+    assert read_list(tmp_path / "test.txt") == ()

@@ -3,7 +3,7 @@
 from fnmatch import fnmatch
 from pathlib import Path
 
-from padgs.data.capture import DataError, listed
+from padgs.data.capture import OTHERS, DataError, listed
 from padgs.data.formats.colmap import find_model
 from padgs.data.formats.metashape import find_xml, xml_files
 
@@ -61,7 +61,7 @@ def detect(path: Path) -> tuple[str, str]:
     name, *others = found
     reason = f"format: {name}, detected by {found[name]}"
     if others:
-        reason += f" (also present, not used: {', '.join(found[other] for other in others)}; set data.format to choose)"
+        reason += f" ({OTHERS}: {', '.join(found[other] for other in others)}; set data.format to choose)"
     return name, reason
 
 

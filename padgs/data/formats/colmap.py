@@ -17,19 +17,33 @@ from padgs.data.cloud import first_ply
 from padgs.data.formats import colmap_files as model_files
 from padgs.data.formats.colmap_lens import lens_of, pycolmap_module
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
+from padgs.data.images import EXTENSIONS
 from padgs.data.splits import check_name
 
 PLY = ("points3D.ply", "points3d.ply", "points.ply", "fused.ply")  # in place of the points file
 
 
 def find_model(path: Path) -> Path | None:
-    """Find the folder with the model's files, in a data set's folder or itself; the largest of several parts."""
+    """Find the folder with the model's files, in a data set's folder or itself; of several parts that with most images.
+
+    Beside the panoramas images.txt may be anything.
+    """
     for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
         parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
-        sizes = {part: file.stat().st_size for part in parts if (file := model_files.find_file(part, "images"))}
-        if sizes:
+        files = ((part, model_files.find_file(part, "images")) for part in parts)
+        sizes = {part: (_count(file), file.stat().st_size) for part, file in files if file}
+        if sizes and (folder != path or model_files.find_file(path, "cameras")):
             return max(sizes, key=lambda part: sizes[part])
     return None
+
+
+def _count(file: Path) -> int:
+    """Return how many images the images file of a model says that it holds, without reading their poses."""
+    if file.suffix == ".txt":
+        with file.open("rb") as lines:
+            return sum(line.strip().lower().endswith(tuple(map(str.encode, EXTENSIONS))) for line in lines)
+    with file.open("rb") as content:
+        return int.from_bytes(content.read(8), "little")
 
 
 def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture:

@@ -6,10 +6,9 @@ Matrices that are not rotations are refused, because slightly wrong poses silent
 import torch
 from torch import Tensor
 
-from padgs.data.capture import DataError
+from padgs.data.capture import FARTHEST, DataError
 
 TOLERANCE = 1e-3  # of R R^T - I; accepts files with four digits, refuses scaled or sheared matrices
-FARTHEST = 1e15  # world units, the limit of renderers (`padgs.render.contract`)
 
 # `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
 OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenGL: y up, z backward

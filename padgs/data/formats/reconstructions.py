@@ -18,6 +18,8 @@ from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center, cam_from_world, rotation_from_vector
 from padgs.data.splits import check_name
 
+CEREAL_ID = 2**31 - 1  # bits of a polymorphic_id that number the class; the highest marks its first object
+
 
 class MvgView(NamedTuple):
     """An entry of OpenMVG's `views`."""
@@ -26,23 +28,30 @@ class MvgView(NamedTuple):
     pose: int  # id_pose
     name: str  # local_path/filename
     size: tuple[int, int]  # width, height
+    intrinsic: int | None  # id_intrinsic
 
 
 def read_openmvg(path: Path, options: DataOptions) -> Capture:
     """Read `sfm_data.json`. Its points have no colours; a colorized.ply beside it is preferred."""
     file = file_in(path, "sfm_data.json")
     folder, data = file.parent, read_json(file)
-    for item in data["intrinsics"].entries():  # cereal names a class only where it first occurs
-        name = item["value"].get("polymorphic_name")
-        if name and name.text() != "spherical":
-            raise DataError(f"{file} holds a {name.text()!r} camera; only spherical cameras (panoramas) can be used")
     views, poses = _mvg_views(data), _mvg_poses(data)
+    posed = [view for view in views if view.pose in poses]
+    used = {view.intrinsic for view in posed}
+    names: dict[int, str] = {}  # of classes
+    for item in data["intrinsics"].entries():  # cereal names a class only where it first occurs
+        value = item["value"]
+        number = value["polymorphic_id"].whole() & CEREAL_ID if value.get("polymorphic_id") else 0
+        if name := value.get("polymorphic_name"):
+            names[number] = name.text()
+        kind = names.get(number, "spherical")
+        if kind != "spherical" and not used.isdisjoint({item["key"].whole(), None}):
+            raise DataError(f"{file} holds a {kind!r} camera; only spherical cameras (panoramas) can be used")
     # The image folder on the machine of the reconstruction; only its last name is used, because a file from elsewhere
     # must not reach other folders.
     stated = data.get("root_path")
     root = PurePosixPath(stated.text().replace("\\", "/")).name if stated else ""
     images = image_folder(folder, options.images, ("images", "imgs", *({root} - {"", ".."})))
-    posed = [view for view in views if view.pose in poses]
     frames = tuple(Frame(view.name, images / view.name, poses[view.pose], *view.size) for view in posed)
     if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply")):
         note = "points: from the PLY file beside sfm_data.json, which has colours"
@@ -82,7 +91,8 @@ def _mvg_views(data: Json) -> list[MvgView]:
         folder = local.text().strip("/") if local else ""
         name = check_name(f"{folder}/{name}" if folder else name, data.where)
         size = view["width"].whole(), view["height"].whole()
-        views.append(MvgView(key.whole(), (view.get("id_pose") or key).whole(), name, size))
+        camera = view.get("id_intrinsic")
+        views.append(MvgView(key.whole(), (view.get("id_pose") or key).whole(), name, size, camera and camera.whole()))
     return views
 
 

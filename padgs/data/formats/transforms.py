@@ -9,6 +9,7 @@ from posixpath import commonpath
 
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, first_of
 from padgs.data.cloud import first_ply, read_ply
+from padgs.data.depths import HOW
 from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
@@ -37,7 +38,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side, meta in metas.items():
-        part = [_frame(meta, frame, root) for frame in meta["frames"].entries()]
+        part = [_frame(meta, frame, folder, root) for frame in meta["frames"].entries()]
         frames += part
         if len(metas) > 1:
             split[side] = tuple(frame.name for frame in part)
@@ -54,7 +55,10 @@ def read(path: Path, options: DataOptions) -> Capture:
     if options.points == "auto":  # else a missing or damaged file does not matter
         cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
     meant = mask.text() if mask else "auto"  # as `padgs split` states it
-    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant)
+    notes = ()
+    if any(frame.get("depth_file_path") for meta in metas.values() for frame in meta["frames"].entries()):
+        notes = (f"depth: depth_file_path is not read; {HOW}",)
+    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant, notes=notes)
 
 
 def transforms_file(path: str | None, format: str) -> Path | None:
@@ -65,7 +69,7 @@ def transforms_file(path: str | None, format: str) -> Path | None:
     return file if file.is_file() else None
 
 
-def _frame(meta: Json, frame: Json, root: Path) -> Frame:
+def _frame(meta: Json, frame: Json, folder: Path, root: Path) -> Frame:
     name = _name(frame["file_path"])
     stated = frame.get("camera_model") or meta.get("camera_model")
     model = stated and stated.text()
@@ -80,7 +84,7 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
     share = stated.numbers()
     if share.ndim or not 0 < share <= 1:
         raise DataError(f"{stated.where} is {stated.value}; it must be a number above 0 and at most 1, for each pass")
-    return Frame(name, root / name, pose, width, height, mask and mask.path_in(root), share=share.item())
+    return Frame(name, root / name, pose, width, height, mask and mask.path_in(folder), share=share.item())
 
 
 def _name(path: Json) -> str:

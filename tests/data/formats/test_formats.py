@@ -2,13 +2,23 @@
 
 import json
 import os
+import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from support.fixtures import WRITERS, World, paint, write_colmap_binary, write_colmap_text, write_transforms
+from support.fixtures import (
+    WRITERS,
+    World,
+    paint,
+    write_colmap_binary,
+    write_colmap_text,
+    write_openmvg,
+    write_transforms,
+)
 
 from padgs.data import DataError, load, read
 from padgs.data.formats.transforms import transforms_file
@@ -171,6 +181,61 @@ def test_several_formats_in_one_folder(world: World, tmp_path: Path) -> None:
     scene = str(tmp_path / "scene")
     assert transforms_file(scene, "auto") is None and transforms_file(None, "auto") is None
     assert transforms_file(scene, "nerfstudio") == tmp_path / "scene" / "transforms.json"
+
+
+def test_a_list_of_names_is_no_colmap_model(world: World, tmp_path: Path) -> None:
+    _written(world, tmp_path)
+    (tmp_path / "scene" / "images.txt").write_text("\n".join(f"{name}.png" for name in world.names))
+    assert load(tmp_path / "scene").notes[0].startswith("format: transforms")
+
+
+@pytest.mark.parametrize("written", [write_colmap_text, write_colmap_binary])
+def test_the_part_with_most_images_is_taken(written: Any, world: World, tmp_path: Path) -> None:
+    written(world, tmp_path)
+    few = next(tmp_path.glob("sparse/0/images.*"))
+    part = tmp_path / "sparse" / "1"
+    shutil.copytree(few.parent, part)
+    if few.suffix == ".txt":  # two images with many observations
+        lines = [line for line in few.read_text().splitlines() if not line.startswith("#")]
+        lines[1] = lines[3] = " ".join(["1.5 2.5 -1"] * 5000)
+        few.write_text("\n".join(lines[:4]) + "\n")
+    else:
+        few.write_bytes(struct.pack("<Q", 2) + few.read_bytes()[8:] + bytes(100_000))
+    note = next(note for note in load(tmp_path).notes if "several parts" in note)
+    assert note == "the model has several parts; the largest, 1, is used, not 0"
+
+
+def test_errors_name_the_other_formats_of_the_folder(world: World, tmp_path: Path) -> None:
+    _written(world, tmp_path)
+    write_colmap_text(world, tmp_path / "other")
+    shutil.copytree(tmp_path / "other" / "sparse", tmp_path / "scene" / "sparse")
+    cameras = tmp_path / "scene" / "sparse" / "0" / "cameras.txt"
+    also = r".*also present, not used: transforms.json; set data.format to choose"
+    for text, error in ((f"1 PINHOLE {world.size[0]} {world.size[1]} 30 30 32 16\n", "other cameras"), ("x\n", "")):
+        cameras.write_text(text)
+        with pytest.raises(DataError, match=error + also):
+            load(tmp_path / "scene")
+
+
+def test_cameras_of_openmvg_that_no_view_uses_do_not_matter(world: World, tmp_path: Path) -> None:
+    write_openmvg(world, tmp_path)
+    file = tmp_path / "sfm_data.json"
+    data = json.loads(file.read_text())
+    value = {"polymorphic_id": 2147483650, "polymorphic_name": "pinhole", "ptr_wrapper": {}}
+    data["intrinsics"] += [{"key": 7, "value": value}, {"key": 8, "value": {**value, "polymorphic_id": 2}}]
+    del data["intrinsics"][-1]["value"]["polymorphic_name"]  # named where it first occurs
+    file.write_text(json.dumps(data))
+    assert len(load(tmp_path).train) == len(world.train)
+    for key in (7, 8):
+        data["views"][0]["value"]["ptr_wrapper"]["data"]["id_intrinsic"] = key
+        file.write_text(json.dumps(data))
+        with pytest.raises(DataError, match="holds a 'pinhole' camera; only spherical"):
+            load(tmp_path)
+
+
+def test_depths_of_nerfstudio_are_not_read_and_it_is_said(world: World, tmp_path: Path) -> None:
+    _written(world, tmp_path, lambda meta: [frame.update(depth_file_path="d.png") for frame in meta["frames"]])
+    assert any(note.startswith("depth: depth_file_path is not read; ") for note in load(tmp_path / "scene").notes)
 
 
 def _written(
