@@ -1,6 +1,9 @@
 """Registry of the compared methods; other packages add methods by entry points, see docs/your_own_method."""
 
+import hashlib
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 
 METHODS = {
     "padgs": "padgs.methods.anchors.method:PaDGSMethod",
@@ -33,9 +36,21 @@ def clash() -> str | None:
 
 
 def distribution(method: str) -> str:
-    """Return name and version of the package that provides a method; empty for a built-in one."""
+    """Return name, version and a digest of the code of the package that provides a method; empty for a built-in one.
+
+    A package that is being written changes without its version.
+    """
     points = () if method in BUILT_IN else entry_points(group=GROUP, name=method)
-    return " ".join(f"{point.dist.name} {point.dist.version}" for point in points if point.dist)
+    return " ".join(f"{point.dist.name} {point.dist.version} {_code(point.module)}" for point in points if point.dist)
+
+
+def _code(module: str) -> str:
+    """Return a digest of the Python files of a module's top-level package, which is not imported."""
+    spec = find_spec(module.partition(".")[0])
+    folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    files = files or [Path(spec.origin)] if spec and spec.origin else files
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()[:8]
 
 
 METHODS |= {name: value for name, value in outside().items() if name not in BUILT_IN}

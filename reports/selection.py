@@ -191,7 +191,8 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
 def _is_one_of(names: Collection[str], patterns: Iterable[str]) -> bool:
     """Return whether a name fits a pattern; - and _ are alike, because `padgs-run` has scenes with _."""
     plain = [name.replace("_", "-") for name in names]
-    return any(fnmatchcase(name, pattern.replace("_", "-")) for name in plain for pattern in patterns)
+    wanted = [pattern.replace("_", "-") for pattern in patterns]
+    return any(name == pattern or fnmatchcase(name, pattern) for name in plain for pattern in wanted)
 
 
 def experiment_of(name: str) -> str:

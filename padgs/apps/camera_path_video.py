@@ -68,7 +68,7 @@ def views_along(
         up = gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).up
         data_set = run.config.data
         try:
-            poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))
+            poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format), fps=fps)
         except DataError as error:  # which would be taken for one of the run's data
             raise ValueError(str(error)) from error
         poses = move_origin(poses, scene.origin)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -109,7 +109,8 @@ class ExternalRun(LoadedRun):
 
     notes: tuple[str, ...] = ()
     program: tuple[str, str] = ("", "")  # name and version
-    given: Similarity | None = None  # scene_from_file, as the user stated it
+    given: Similarity = field(default_factory=Similarity)  # data_from_file, as the user stated it
+    world: Similarity = field(default_factory=Similarity)  # scene_from_data: a shift of files in map coordinates
     file: Path = Path()
 
     @classmethod
@@ -117,13 +118,15 @@ class ExternalRun(LoadedRun):
         """Open a file of Gaussians with a suffix of `SPLATS`, rendered by a name of `RAYS`; device: auto, cpu or cuda.
 
         `config` is from `config_of`; None: no data set, so the scene is made of the Gaussians, without photographs.
-        `transform` is scene_from_file for `read_transform`, in the world of the data set; empty: the identity.
+        `transform` is data_from_file for `read_transform`; empty: the identity. Where the data set has map coordinates,
+        from which its scene is shifted, Gaussians nearer to the data's place than to the scene's are shifted too.
         """
         if rays not in RAYS:
             raise ValueError(unknown("--rays", rays, RAYS))
         render, notes = RAYS[rays], list[str]()
         config = None if config is None else replace(config, render=render)
-        moved = read_transform(transform, config and _transforms_json(config)) if transform else None
+        given = read_transform(transform, config and _transforms_json(config)) if transform else Similarity()
+        world = Similarity()
         splats = read_splats(file)
         if not len(splats):
             raise DataError(f"{file} has no Gaussians; export it again")
@@ -135,16 +138,17 @@ class ExternalRun(LoadedRun):
         if not len(splats):
             raise DataError(f"{file} has no Gaussians with finite values; export it again")
         program = program_of(file)
-        if moved is not None:
-            splats = transform_splats(splats, moved)
         if config is None:
             scene = scene_without_photographs(splats, file)
             config = RunConfig(render=render, method=METHOD, options=ExternalOptions(), protocols={})
             scene = scene.to(choose_device(device, render))
         else:
             scene = load_scene(config, choose_device(device, render))
-            if scene.origin.any() and program[0] != "padgs":  # whose exports are in the world of `scene`
-                splats = transform_splats(splats, Similarity(translation=-scene.origin.double().cpu()))
+            origin = scene.origin.double().cpu()
+            place = given(splats.means.detach().double().median(0).values)
+            if (place - origin).norm() < place.norm():
+                world = Similarity(translation=-origin)
+        splats = transform_splats(splats, world @ given)  # at once, because float32 holds no map coordinates
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
             raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -154,7 +158,7 @@ class ExternalRun(LoadedRun):
         folder = file.with_name(re.sub(r"(\.compressed)?\.\w+$", "", file.name))
         method = ExternalMethod.of(splats, render)
         result = initial_result(config, scene, folder.name)
-        run = cls(folder, config, method, result, 0, "", tuple(notes), program, moved, file)
+        run = cls(folder, config, method, result, 0, "", tuple(notes), program, given, world, file)
         run.scene = scene
         return run
 
@@ -166,15 +170,14 @@ class ExternalRun(LoadedRun):
         def render(moved: Similarity, view: View) -> Rendering:  # moves the camera, not the Gaussians
             return self.method.render(view.at(moved.inverse().pose(view.cam_from_world).to(view.cam_from_world)))
 
-        known = self.folder.parent / TRANSFORMS
-        nerfstudio = nerfstudio_similarity(known, _transforms_json(self.config)) if known.is_file() else None
-        found, given = check_frame(self.scene, render, opaque, nerfstudio), self.given or Similarity()
+        known, nerfstudio = self.folder.parent / TRANSFORMS, None
+        if known.is_file():
+            shift = Similarity(translation=-self.scene.origin.double().cpu())
+            nerfstudio = shift @ nerfstudio_similarity(known, _transforms_json(self.config))
+        found = check_frame(self.scene, render, opaque, nerfstudio)
         if found.suggestion is None:
             return found
-        if self.program[0] == "padgs":
-            return replace(found, suggestion=found.suggestion @ given)
-        shift = Similarity(translation=self.scene.origin.double().cpu())  # `open` moved the Gaussians by its inverse
-        return replace(found, suggestion=shift @ found.suggestion @ shift.inverse() @ given)
+        return replace(found, suggestion=self.world.inverse() @ found.suggestion @ self.world @ self.given)
 
 
 def open_model(
@@ -209,7 +212,7 @@ def scene_without_photographs(splats: Splats, file: Path) -> Scene:
 
 def program_of(file: Path) -> tuple[str, str]:
     """Return name and version of the program that wrote a PLY file, by its comments; empty if none says so."""
-    if file.suffix == ".ply":
+    if file.suffix.lower() == ".ply":
         with file.open("rb") as opened:
             header = opened.read(1 << 14).partition(b"end_header")[0].decode("utf-8", "replace")
         for line in header.splitlines():

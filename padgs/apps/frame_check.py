@@ -84,8 +84,9 @@ def as_numbers(similarity: Similarity) -> str:
     '2 0 0 0  0 2 0 0.5  0 0 2 1'
     """
     rows = torch.cat((similarity.scale * similarity.rotation, similarity.translation[:, None]), dim=1)
-    rows = rows + 0.0  # no -0
-    return "  ".join(" ".join(f"{0.0 if abs(n) < 1e-9 else n:.7g}" for n in row) for row in rows.tolist())
+    rows = torch.where(rows.abs() < 1e-9, 0.0, rows)  # no -0
+    digits = 15 if rows[:, 3].abs().max() > 1e4 else 7  # rotations of map coordinates move them far
+    return "  ".join(" ".join(f"{n:.{digits}g}" for n in row) for row in rows.tolist())
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import typer
 
 from padgs.cli.errors import DataPath, Model, Rays, Transform, check_range, name_place, show
 
-MAX_SIDE, MAX_FRAMES = 16384, 100_000  # larger images and longer videos fill the memory
+MAX_SIDE = 16384  # larger images fill the memory
 
 
 def render(
@@ -32,6 +32,7 @@ def render(
 
     from padgs.apps.camera_path_video import depth_unit, views_along, write_video
     from padgs.apps.external import open_model
+    from padgs.data.formats.path_file import MAX_FRAMES
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")

@@ -67,6 +67,8 @@ def report(
         except ReportError as error:
             refused += 1
             show(f"{'error' if single or strict else 'left out'}: {name}: {error}", sys.stderr)
+            if single:
+                raise typer.Exit(1) from error
             continue
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
@@ -94,7 +96,9 @@ def _writing_to(folder: Path) -> Iterator[None]:
 
 
 def _listed(values: list[str] | None) -> tuple[str, ...]:
-    return tuple(name for value in values or () for name in value.split(",") if name)
+    # Names of scenes may have commas, before a space mostly.
+    names = (name for value in values or () for name in (*value.split(","), value if ", " in value else "") if name)
+    return tuple(dict.fromkeys(names))
 
 
 def _pairs(settings: list[str] | None) -> dict[str, str]:
@@ -103,5 +107,6 @@ def _pairs(settings: list[str] | None) -> dict[str, str]:
         key, equals, value = setting.partition("=")
         if not equals:
             raise ReportError(f"--where {setting} is not KEY=VALUE, e.g. --where train.iterations=3000")
-        pairs[key] = value
+        if pairs.setdefault(key, value) != value:
+            raise ReportError(f"--where {key} is {pairs[key]} and {value}; give one value of each key")
     return pairs

@@ -70,7 +70,7 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
     """Read poses, points and split lists of a data set, but no images; for `padgs convert` and `padgs check`."""
     path = Path(path)
     refuse_missing(path, options.dataset)
-    notes = ()
+    notes: tuple[str, ...] = ()
     if format == "auto":
         format, reason = detect(path)
         notes = (reason,)

@@ -315,7 +315,8 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
     if cluster == "slurm":
         for position in wait_for_jobs(submitted, board.stop_requested):
             left = JobState(Status.STOPPED, reason="it left the queue of Slurm before it began")
-            board.write(first_number + position, left)
+            if board.read(first_number + position).status == Status.WAITING:  # its log may be on another machine
+                board.write(first_number + position, left)
         return
     for job in submitted:
         with suppress(Exception):  # a job without results died; the board tells which

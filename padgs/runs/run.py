@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -76,6 +77,8 @@ def run(
     result = store.result()
     if result is not None and not _is_incomplete(config, scene, result):
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
+        if (code := distribution(config.method)) and not result.code_version.endswith(code):
+            advice += f"; it was trained by other code of the method ({result.code_version}): delete it to train again"
         say(words, f"finished before, nothing to do{advice}")
         show_result(result, store.path, words)
         return result
@@ -298,10 +301,34 @@ def _is_retried(config: RunConfig, result: Result) -> bool:
 
 
 def _unscored(config: RunConfig, scene: Scene, result: Result) -> dict[str, Protocol]:
-    """Return the protocols under whose exact rules a run that ended well has no scores of its test views, if any."""
-    known = {name: json.dumps(scores.protocol, sort_keys=True) for name, scores in result.scores.items()}
+    """Return the protocols under whose rules a run that ended well has no scores of its test views, if any."""
     asked = config.protocols.items() if result.ok and scene.test else ()
-    return {name: rules for name, rules in asked if known.get(name) != json.dumps(asdict(rules), sort_keys=True)}
+    known = {name: scores.protocol for name, scores in result.scores.items()}
+    return {name: rules for name, rules in asked if name not in known or not _covers(known[name], _stored(rules))}
+
+
+def _stored(rules: Protocol) -> dict[str, Any]:
+    return json.loads(json.dumps(asdict(rules)))
+
+
+def _covers(rules: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
+    """Return whether scores under rules have all that others ask for: they are the same, but may have LPIPS besides."""
+    lpips = ("lpips", "lpips_inputs") if others.get("lpips") == "none" else ()
+    return {**rules, **{key: others.get(key) for key in lpips}} == others
+
+
+def _refuse_other_rules(store: RunStore, result: Result, unscored: Mapping[str, Protocol]) -> None:
+    """Refuse to replace scores by those under other rules of the same name, which an experiment may be about."""
+    for name, asked in ((name, _stored(rules)) for name, rules in unscored.items() if name in result.scores):
+        rules = result.scores[name].protocol
+        if not _covers(asked, rules):
+            others = ", ".join(
+                f"{key}={rules.get(key)}, not {asked[key]}" for key in asked if rules.get(key) != asked[key]
+            )
+            raise RunFolderError(
+                f"{store.path} has scores of {name} under other rules ({others}), and a run has scores of one; "
+                "set run.folder to another folder"
+            )
 
 
 def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Console) -> Result | None:
@@ -313,6 +340,7 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
         return None
     complete = replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
     if unscored := _unscored(config, scene, result):
+        _refuse_other_rules(store, result, unscored)
         say(console, "finished before; only the new protocol is missing")
         if not store.has_checkpoint:  # an untrained method would be scored
             raise RunFolderError(

@@ -112,8 +112,13 @@ def test_runs_of_methods_that_fail_say_so_by_name(broken, place, monkeypatch):
         config_from_values({"method": {"name": "broken"}, "protocol": {"paper": {}}})
 
 
-def test_results_say_which_package_they_are_of(installed):
+def test_results_say_which_package_they_are_of(installed, tmp_path, monkeypatch):
     config = config_from_values({"method": {"name": "my_method"}, "protocol": {"paper": {}}})
-    assert initial_result(config, tiny_scene(), "run").code_version.endswith(" my-method 0.1")
+    before = initial_result(config, tiny_scene(), "run").code_version
+    assert " my-method 0.1 " in before
+    (tmp_path / "my_method.py").write_text(f"{inspect.getsource(sys.modules['my_method'])}# changed")
+    monkeypatch.delitem(sys.modules, "my_method")
+    importlib.invalidate_caches()
+    assert initial_result(config, tiny_scene(), "run").code_version != before, "the same version, other code"
     assert distribution("padgs") == ""
     assert (methods.title("my_method"), methods.color("my_method")) == ("My method", "#8a5a2b")

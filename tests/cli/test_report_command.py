@@ -87,6 +87,7 @@ def test_control_characters_in_names_are_escaped(tmp_path):
     [
         (["table9"], f"unknown report 'table9'; known: {', '.join(sorted(REPORTS))}, all"),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
+        (["runs", "--where", "seed=1", "--where", "seed=2"], "--where seed is 1 and 2; give one value of each key"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
         (["sweep"], "nothing to show for sweep"),
@@ -96,7 +97,14 @@ def test_control_characters_in_names_are_escaped(tmp_path):
 )
 def test_invalid_arguments_are_refused(runs, arguments, message):
     done = report(arguments[0], runs, *arguments[1:])
-    assert done.exit_code == 1 and message in done.output
+    assert done.exit_code == 1 and message in done.output and "; see " not in done.output
+
+
+def test_scenes_may_have_commas_in_their_names(tmp_path):
+    first, *_, last = compared(["synthetic-room"], seeds=1)
+    write([replace(first, dataset="", scene="Flat, old"), last], tmp_path)
+    done = report("runs", tmp_path, "--scene", "Flat, old")
+    assert done.exit_code == 0 and "Flat, old" in done.output and "synthetic-room" not in done.output
 
 
 def test_a_missing_folder_is_refused(tmp_path):

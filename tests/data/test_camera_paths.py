@@ -160,14 +160,18 @@ def test_nerfstudio_paths_are_converted_to_the_scene(applied, tmp_path):
     theirs[:, :3, :3] = rotation @ ours[:, :3, :3] @ np.diag([1, -1, -1])
     theirs[:, :3, 3] = scale * (ours[:, :3, 3] @ rotation.T + shift)
     cameras = [{"camera_to_world": pose.ravel().tolist(), "fov": 75, "aspect": 1} for pose in theirs]
-    (tmp_path / "path.json").write_text(json.dumps({"camera_path": cameras, "fps": 24, "seconds": 2}))
+    (tmp_path / "path.json").write_text(json.dumps({"camera_path": cameras, "fps": 24, "seconds": 0.1}))
     before = np.vstack((applied.get("applied_transform", np.eye(3, 4)), (0, 0, 0, 1)))
     transform = np.column_stack((rotation, shift)) @ before
     normalized = {"transform": transform.tolist(), "scale": scale * applied.get("applied_scale", 1)}
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(normalized))
     (tmp_path / "transforms.json").write_text(json.dumps(applied))
     found = read_path(tmp_path / "path.json", None, UP, tmp_path / "transforms.json")
-    assert np.allclose(found.numpy(), np.linalg.inv(ours))
+    assert np.allclose(found.numpy(), np.linalg.inv(ours)), "0.1 s have three frames at 30 a second"
+    assert len(read_path(tmp_path / "path.json", None, UP, tmp_path / "transforms.json", fps=120)) == 12
+    (tmp_path / "dataparser_transforms.json").unlink()
+    with pytest.warns(UserWarning, match="there is no dataparser_transforms.json beside the camera path"):
+        assert not np.allclose(read_path(tmp_path / "path.json", None, UP).numpy(), np.linalg.inv(ours))
 
 
 KEY = '{"position": [0, 0, 0], "look_at": [1, 0, 0]}'
@@ -184,22 +188,21 @@ ROWS = "[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]"
         ("{}", "lacks the field 'keyframes'"),
         ('{"keyframes": [{"position": [0, 0, 0]}]}', "entry 0 of keyframes of .* lacks the field 'look_at'"),
         (f'{{"keyframes": [{KEY}]}}', "has 1 poses; a path needs at least two"),
-        (
-            '{"keyframes": [{"position": [1, 2, 3], "look_at": [1, 2, 3]}]}',
-            "give different positions and a non-zero up",
-        ),
-        (f'{{"up": [0, 0, 0], "keyframes": [{KEY}]}}', "or up is 0"),
+        ('{"keyframes": [{"position": [1, 2, 3], "look_at": [1, 2, 3]}]}', "give different ones"),
+        (f'{{"up": [0, 0, 0], "keyframes": [{KEY}]}}', "up is 0; give a direction"),
         (f'{{"up": "z", "keyframes": [{KEY}]}}', "up of .* is not an array of numbers"),
         (KEY.join(('{"keyframes": [', "]}")).replace("1", "NaN"), "is not finite"),
         (KEY.join(('{"keyframes": [', "]}")).replace("1", '"1"'), "look_at of .* is not an array of numbers"),
         (KEY.join(('{"keyframes": [', "]}")).replace("1", "true"), "look_at of .* is not an array of numbers"),
         (f'{{"keyframes": [{{"cam_from_world": [{ROWS}, [0, 0, 0, 2]]}}]}}', "last row .* must be 0 0 0 1"),
         (f'{{"keyframes": [{{"cam_from_world": [{ROWS}]}}]}}', r"shape \[3, 4\]; it must be \[4, 4\]"),
+        (KEY.join(('{"keyframes": [', "]}")).replace("1", "1e300"), "is not finite, or beyond 1e"),
         ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "has 2 numbers; a pose has 16"),
         ('{"camera_path": [{"camera_to_world": [2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}]}', "is not a rotation"),
         ('{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,2]}]}', "must be 0 0 0 1"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:there is no dataparser")
 def test_invalid_path_files_are_refused(text, message, tmp_path):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(DataError, match=message):

@@ -133,6 +133,8 @@ def test_methods_and_scenes_are_chosen_by_names_and_patterns():
         return set(runs["scene"]), set(runs["preset"])
 
     assert shown(scenes=("my-room",)) == ({"my_room"}, {"omnigs"})
+    made += [replace(made[0], dataset="", scene="Flat [2]", run="flat")]
+    assert shown(scenes=("Flat [2]",))[0] == {"Flat [2]"}, "as it is written"
     assert shown(scenes=("lab", "c?nter*"))[0] == {"lab", "center", "center1"}
     assert shown(scenes=("roam360",), methods=("o*",)) == (shown()[0] - {"my_room"}, {"omnigs", "odgs"})
     assert shown(where={"scene": "bar", "method": "padgs"}) == ({"bar"}, {"padgs"})

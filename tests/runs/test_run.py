@@ -160,6 +160,25 @@ def test_another_protocol_scores_the_finished_run_without_training(config, monke
     assert both.scores["sphere"].metrics["ws_psnr"] is not None
 
 
+def test_scores_are_not_replaced_by_those_under_other_rules_of_the_same_name(config, monkeypatch):
+    def under(*overrides):
+        protocols = composed("protocol=paper", "protocol.paper.lpips=none", *overrides).protocols
+        return replace(config, protocols=protocols)
+
+    first, _ = run(under())
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
+    with pytest.raises(RunFolderError, match=r"scores of paper .*\(bottom_crop=0.0, not 0.25\).* set run.folder"):
+        run(under("protocol.paper.bottom_crop=0.25"))
+    assert folder_of(config).result() == first
+    monkeypatch.setattr(pipeline, "score", lambda *_: {"paper": replace(first.scores["paper"], protocol=with_lpips)})
+    asked = under("protocol.paper.lpips=alex")
+    with_lpips = first.scores["paper"].protocol | {"lpips": "alex"}
+    assert run(asked)[0].scores["paper"].protocol == with_lpips, "more than before"
+    assert run(under())[0].scores["paper"].protocol == with_lpips, "less keeps what there is"
+    with pytest.raises(RunFolderError, match=r"\(lpips=alex, not vgg\)"):
+        run(under("protocol.paper.lpips=vgg"))
+
+
 def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
     first, _ = run(config)
     folder = folder_of(config)

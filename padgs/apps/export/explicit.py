@@ -61,6 +61,8 @@ def export_run(
         if (world := run.method.world) is not None:
             splats = transform_splats(splats, world.inverse())
         notes.append("Gaussians as trained")
+        if distillation_steps != DISTILLATION_STEPS:
+            notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats, smooth = smoothed(splats, cameras_of(run.scene.train), config.low_pass), False
             notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
@@ -75,7 +77,9 @@ def export_run(
         low, high = splats.means.new_tensor(crop).view(2, 3)
         inside = ((splats.means >= low) & (splats.means <= high)).all(-1)
         if not inside.any():
-            raise ValueError(f"no Gaussian lies in the box from {low.tolist()} to {high.tolist()}; enlarge --crop")
+            box, means = f"the box from {low.tolist()} to {high.tolist()}", splats.means
+            there = f"they are from {means.min(0).values.tolist()} to {means.max(0).values.tolist()}"
+            raise ValueError(f"no Gaussian lies in {box}; {there}, in the world of `padgs view`: change --crop")
         notes.append(f"cropped to {int(inside.sum())} of {len(splats)} Gaussians")
         splats = deepcopy(splats)
         splats.load({name: rows[inside] for name, rows in splats.rows().items()})
@@ -123,9 +127,10 @@ def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None
         evaluate(render_view, scene.test or scene.train, protocol).metrics["ws_psnr"] or 0
         for render_view in (method.render, render_splats)
     )
+    change = f"{abs(after - before):.2f} dB {'below' if after < before else 'above'} the run's {before:.2f} dB"
     return splats, (
         f"baked: {len(splats)} of {method.size().counts['gaussians']} Gaussians are visible; WS-PSNR of the {kind} "
-        f"views {after:.2f} dB, {before - after:.2f} dB below the run's {before:.2f} dB"
+        f"views {after:.2f} dB, {change}"
     )
 
 

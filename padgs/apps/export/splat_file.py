@@ -7,6 +7,7 @@ option (`--sh_degree` of 3DGS). Padding with zeros would make small files three 
 """
 
 import json
+import os
 import shutil
 import subprocess
 import tempfile
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from padgs.data.capture import DataError
 from padgs.data.cloud import read_vertices
-from padgs.files import atomic_path, draft_of
+from padgs.files import atomic_path, check_place, draft_of
 from padgs.methods.splats.smoothing_filter import widened
 from padgs.methods.splats.splats import Splats
 
@@ -52,17 +53,27 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
             viewer = {"camera": camera, "background": {"color": [0, 0, 0]}, "animTracks": []}
             (folder / "viewer.json").write_text(json.dumps(viewer))
             settings = ["--viewer-settings", str(folder / "viewer.json")]
-        _convert(plain, path, *settings)
+        try:
+            _convert(plain, path, *settings)
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be written ({error}); name another place, or write a .ply") from error
 
 
 def _convert(source: Path, target: Path, *more: str) -> None:
+    # The converter leaves files of its own beside its target after an error, so that is in a folder that is removed.
     # One iteration over the palette of .sog and .html: 27 000 Gaussians take 26 s; ten take 226 s and gain 0.01 dB.
     options = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
-    with atomic_path(target) as draft:
-        command = [CONVERTER, *options, *more, str(source.resolve()), str(draft.resolve())]
+    check_place(target)
+    with draft_of(target.with_name(f"{target.name}-new")) as folder:
+        folder.mkdir()
+        made = folder / target.name
+        command = [CONVERTER, *options, *more, str(source.resolve()), str(made.resolve())]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        if done.returncode:
-            raise ValueError(f"{CONVERTER} could not convert {source} to {target}: {done.stdout.strip()[-500:]}")
+        if done.returncode or not made.exists():
+            said = [line.strip() for line in done.stdout.splitlines() if line.strip()] or ["without a word"]
+            reason = next((line for line in said if "error" in line.lower() and not line.startswith("at ")), said[0])
+            raise ValueError(f"{CONVERTER} failed: {reason[:300]}")
+        os.replace(made, target)
 
 
 def check_suffix(path: Path) -> None:
@@ -79,14 +90,17 @@ def check_suffix(path: Path) -> None:
 def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     """Read Gaussians from a file; `unit` is the scene scale, which files do not contain.
 
-    Scales include the 3D filter of Mip-Splatting files. A DataError says that a PLY holds no Gaussians, a ValueError
-    that the converter is not installed or fails.
+    Scales include the 3D filter of Mip-Splatting files. A DataError says that a file holds no Gaussians, a ValueError
+    that the converter is not installed.
     """
     if path.name.lower().endswith(CONVERTED):
         check_suffix(path)
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "splats.ply"
-            _convert(path, plain)
+            try:
+                _convert(path, plain)
+            except ValueError as error:
+                raise DataError(f"{path} cannot be read ({error}); export it again") from error
             return read_splats(plain, unit=unit)
     vertex, names = read_vertices(path)
     rest = sum(name.startswith("f_rest_") for name in names)

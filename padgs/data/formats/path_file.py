@@ -6,6 +6,7 @@ right, y up, z backward) in a normalised world, which the run's `dataparser_tran
 beside the path.
 """
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,26 +14,39 @@ import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import PATHS, interpolate_poses, look_along
-from padgs.data.capture import DataError
+from padgs.data.capture import FARTHEST, DataError
 from padgs.data.formats.json_file import Json, read_json
 from padgs.data.formats.poses import OPENCV_FROM_OPENGL, cam_from_pose, rigid
 
+MAX_FRAMES = 100_000  # longer videos fill the memory
 TRANSFORMS = "dataparser_transforms.json"
 
 
 def read_path(
-    file: Path, frames: int | None, up: tuple[float, float, float], transforms_json: Path | None = None
+    file: Path,
+    frames: int | None,
+    up: tuple[float, float, float],
+    transforms_json: Path | None = None,
+    *,
+    fps: float = 30.0,
 ) -> Tensor:
     """Read the poses [F, 4, 4] of a file of keyframes, or a camera path of nerfstudio; a DataError names the place.
 
-    Poses are resampled evenly to a number of `frames`; None: a camera path as it is, or 30 poses between two keyframes.
-    `up` is the default of keyframes with look_at. `transforms_json` is the file from which the scene was read, if any.
+    Poses are resampled evenly to a number of `frames`; None: `fps` for each of the seconds that a camera path states,
+    else its own poses, or 30 poses between two keyframes. `up` is the default of keyframes with look_at.
+    `transforms_json` is the file from which the scene was read, if any.
     """
     if not file.exists():
         raise DataError(f"the path {file} does not exist; known: {', '.join(PATHS)}, or a JSON file")
     content = read_json(file)
     if cameras := content.get("camera_path"):
         poses = _nerfstudio(cameras, file.parent / TRANSFORMS, transforms_json)
+        if frames is None and (stated := content.get("seconds")):
+            seconds = stated.numbers()
+            if seconds.ndim or not 0 < seconds * fps <= MAX_FRAMES:
+                rule = f"it must be a number above 0, for at most {MAX_FRAMES} frames at {fps:g} a second"
+                raise DataError(f"{stated.where} is {stated.value}; {rule}")
+            frames = max(2, round(seconds.item() * fps))
     else:
         stated = content.get("up")
         upwards = stated.numbers(3) if stated else torch.tensor(up, dtype=torch.float64)
@@ -48,17 +62,23 @@ def _keyframe(entry: Json, up: Tensor) -> Tensor:
     if pose := entry.get("cam_from_world"):
         return torch.linalg.inv(cam_from_pose(pose.numbers(4, 4), pose.where))
     position, target = entry["position"].numbers(3), entry["look_at"].numbers(3)
-    if not torch.cat((position, target, up)).isfinite().all():
-        raise DataError(f"{entry.where}: position, look_at or up is not finite; give numbers")
-    if position.equal(target) or not up.any():
-        equal = f"position and look_at are both {position.tolist()}, or up is 0"
-        raise DataError(f"{entry.where}: {equal}; give different positions and a non-zero up")
+    if not (torch.cat((position, target, up)).abs() <= FARTHEST).all():
+        rule = f"not finite, or beyond {FARTHEST:g}"
+        raise DataError(f"{entry.where}: position, look_at or up is {rule}; give smaller numbers")
+    if not up.any():
+        raise DataError(f"{entry.where}: up is 0; give a direction")
+    if position.equal(target):
+        raise DataError(f"{entry.where}: position and look_at are both {position.tolist()}; give different ones")
     return look_along(position[None].numpy(), (target - position)[None].numpy(), (up / up.norm()).numpy())[0]
 
 
 def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -> list[Tensor]:
-    no_change = 1.0, torch.eye(4, dtype=torch.float64)
-    scale, transform = nerfstudio_world(transforms, transforms_json) if transforms.is_file() else no_change
+    scale, transform = 1.0, torch.eye(4, dtype=torch.float64)
+    if transforms.is_file():
+        scale, transform = nerfstudio_world(transforms, transforms_json)
+    else:
+        where = f"there is no {transforms.name} beside the camera path"
+        warnings.warn(f"{where}: it is taken to be in the world of the data set; copy it from the run", stacklevel=2)
     poses = []
     for entry in cameras.entries():
         stated = entry["camera_to_world"]

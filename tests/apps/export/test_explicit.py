@@ -102,7 +102,7 @@ def test_a_box_is_cropped(splat_run, tmp_path):
     for box, message in (
         ("1 2", "must be six numbers"),
         ("0 0 0 1 1 -1", "must be six"),
-        ("8 8 8 9 9 9", "no Gaussian"),
+        ("8 8 8 9 9 9", "no Gaussian lies in the box from [8.0, 8.0, 8.0] to [9.0, 9.0, 9.0]; they are from ["),
     ):
         result = export(str(splat_run), "--crop", box, "--to", str(tmp_path / "d.ply"))
         assert result.exit_code == 1 and message in result.output + result.stderr

@@ -122,9 +122,12 @@ def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, convert
 
 
 def test_a_failing_converter_is_quoted_and_keeps_the_earlier_file(tmp_path, generator, converter):
-    converter("while [ $# -gt 1 ]; do shift; done; echo half >$1; echo no room left; exit 3")
+    left = 'echo half >"$1"; echo half >"${1%/*}/..tmp"'
+    converter(f"while [ $# -gt 1 ]; do shift; done; {left}; echo 'ERROR no room'; echo 'at f (cli.mjs:9:9)'; exit 3")
     (tmp_path / "a.spz").write_text("the earlier one")
-    with pytest.raises(ValueError, match="could not convert .* to .*a.spz: no room left"):
+    with pytest.raises(ValueError, match=r"a.spz cannot be written \(splat-transform failed: ERROR no room\); name"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
     assert (tmp_path / "a.spz").read_text() == "the earlier one"
+    with pytest.raises(DataError, match=r"a.spz cannot be read \(splat-transform failed: ERROR no room\); export"):
+        read_splats(tmp_path / "a.spz")
     assert {path.name for path in tmp_path.iterdir()} == {"a.spz", splat_file.CONVERTER}
