@@ -133,8 +133,9 @@ def test_methods_and_scenes_are_chosen_by_names_and_patterns():
         return set(runs["scene"]), set(runs["preset"])
 
     assert shown(scenes=("my-room",)) == ({"my_room"}, {"omnigs"})
-    made += [replace(made[0], dataset="", scene="Flat [2]", run="flat")]
-    assert shown(scenes=("Flat [2]",))[0] == {"Flat [2]"}, "as it is written"
+    flat = replace(made[0], dataset="", scene="Flat [2]", run="flat")
+    brackets = run_set([*made, flat], scenes=("Flat [2]",)).requested
+    assert set(brackets["scene"]) == {"Flat [2]"}, "as it is written"
     assert shown(scenes=("lab", "c?nter*"))[0] == {"lab", "center", "center1"}
     assert shown(scenes=("roam360",), methods=("o*",)) == (shown()[0] - {"my_room"}, {"omnigs", "odgs"})
     assert shown(where={"scene": "bar", "method": "padgs"}) == ({"bar"}, {"padgs"})
@@ -175,7 +176,7 @@ def test_other_scenes_have_blocks_of_their_own_with_their_origin():
     room = result("", dataset="synthetic", scene="synthetic-room")
     outdoor, capture = replace(room, scene="synthetic-outdoor"), replace(room, dataset="", scene="hall")
     indoor, outdoors = (markdown(build(run_set([room, outdoor, capture]))) for build in (table1, table2))
-    assert "### synthetic-room (generated)" in indoor and "### hall\n" in indoor
+    assert "### synthetic-room (generated, tuned on)" in indoor and "### hall\n" in indoor
     assert "synthetic-outdoor" in outdoors and "hall" not in outdoors and "synthetic-outdoor" not in indoor
     parts = markdown(table3(run_set([replace(row, dataset="synthetic", scene="synthetic-room") for row in FOUR])))
     assert "### synthetic-room" in parts and "| Baseline | 0.786 | 22.30 | 0.257 |" in parts

@@ -40,7 +40,7 @@ def test_models_of_other_programs_have_rows_beside_the_methods():
     assert value(methods(made), ROOM, "my|splat (external)", "iterations") is None
     text = markdown(methods(made))
     assert "my\\|splat (external): made by Brush 0.3, and only scored by padgs." in text and "Not ranked" not in text
-    assert [block.title for block in runs(made).blocks][0] == f"{ROOM} (generated), 512x256, made elsewhere"
+    assert [block.title for block in runs(made).blocks][0] == f"{ROOM} (generated, tuned on), 512x256, made elsewhere"
 
 
 def test_depth_has_columns_where_a_run_was_scored_by_it_and_is_chosen_by_name():
@@ -90,12 +90,12 @@ def test_means_over_scenes_are_of_one_size_and_length():
     ]
     table = equal_time(run_set([*made, *shorter]))
     assert [block.title for block in table.blocks[:2]] == [
-        f"Average over 2 scenes: {scenes}, 512x256, {seconds} s of CPU time" for seconds in (60, 20)
+        f"Average over 2 scenes tuned on: {scenes}, 512x256, {seconds} s of CPU time" for seconds in (60, 20)
     ]
     assert value(table, table.blocks[0].title, "OmniGS, corrected", "WS-PSNR") == pytest.approx((26 + 30) / 2 - 0.4)
     assert "Not ranked" not in "".join(table.notes)
     assert [block.title for block in equal_time(run_set(made[:3])).blocks] == [
-        "synthetic-room (generated), 512x256, 60 s of CPU time"
+        "synthetic-room (generated, tuned on), 512x256, 60 s of CPU time"
     ]
 
 

@@ -218,7 +218,7 @@ def test_each_time_has_a_block():
     short = [timed("padgs", 20, 250, 20), timed("omnigs", 20, 300, 21)]
     long = [timed("padgs", 60, 700, 26), timed("omnigs", 60, 900, 27)]
     table = equal_time(run_set([*short, *long]))
-    place = f"{ROOM} (generated)"
+    place = f"{ROOM} (generated, tuned on)"
     assert [block.title for block in table.blocks] == [f"{place}, 512x256, {s} s of CPU time" for s in (20, 60)]
     for block, *expected in ((f"{place}, 512x256, 20", 250, 20), (f"{place}, 512x256, 60", 700, 26)):
         assert [value(table, block, "PaD-GS", name) for name in ("iterations", "PSNR")] == pytest.approx(expected)

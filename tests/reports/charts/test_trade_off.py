@@ -97,8 +97,8 @@ def test_after_equal_time_only_the_time_per_frame_is_a_cost():
 def test_the_mean_over_scenes_after_equal_time_comes_first():
     runs = at_equal_time("synthetic-room", "synthetic-outdoor")
     mean, *scenes = equal_times(run_set(runs))
-    assert mean.name == "equal_time_mean_512x256_60-s-of-CPU-time" and len(scenes) == 2
-    assert mean.title == "mean over synthetic-outdoor, synthetic-room, 512x256, 60 s of CPU time"
+    assert mean.name == "equal_time_mean_tuned-on_512x256_60-s-of-CPU-time" and len(scenes) == 2
+    assert mean.title == "mean over synthetic-outdoor, synthetic-room (tuned on), 512x256, 60 s of CPU time"
     assert numbers(mean)["OmniGS, corrected", "WS-PSNR"] == pytest.approx((26 + 30) / 2 - 0.4)
     assert [made.name for made in equal_times(run_set(runs[:5]))] == [scenes[1].name], "two methods are no chart"
     (panel, marks, _, _), *_ = draw(mean)[1]

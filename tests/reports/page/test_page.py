@@ -93,7 +93,7 @@ def test_the_number_of_files_is_bounded(runs, monkeypatch):
     monkeypatch.setattr(page, "MAX_FILES", 6)
     assert [len(scene["views"]) for scene in page.album(RunSet(runs)).scenes] == [1]
     monkeypatch.setattr(page, "MAX_FILES", 5)
-    assert page.album(RunSet(runs)).left_out == ["synthetic-room (generated)"]
+    assert page.album(RunSet(runs)).left_out == ["synthetic-room (generated, tuned on)"]
 
 
 @pytest.mark.slow
