@@ -193,7 +193,7 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
 def masks_beside(name: str) -> list[str]:
     """Return the names that a mask may have beside its image, or in a folder of masks.
 
-    >>> masks_beside("hall/a.jpg")[::7]
+    >>> masks_beside("hall/a.jpg")[::9]
     ['hall/a.jpg.png', 'hall/a_mask.bmp']
     """
     stem = PurePosixPath(name).with_suffix("")
