@@ -148,7 +148,8 @@ class ExternalRun(LoadedRun):
             place = given(splats.means.detach().double().median(0).values)
             if (place - origin).norm() < place.norm():
                 world = Similarity(translation=-origin)
-        splats = transform_splats(splats, world @ given)  # at once, because float32 holds no map coordinates
+        if transform or world.translation.any():  # at once, because float32 holds no map coordinates
+            splats = transform_splats(splats, world @ given)
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
             raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
         digest = hashlib.sha256(file.read_bytes()).hexdigest()

@@ -84,7 +84,7 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
     except DataError as error:
         if not any(OTHERS in note for note in notes):
             raise
-        raise DataError(f"{error}; {notes[0]}") from error
+        raise DataError("; ".join((str(error), *notes))) from error
     if not isinstance(capture, Capture):
         raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask

@@ -57,7 +57,7 @@ OF_FAILURES = ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam")
 PROTOCOLS = {
     # The evaluation released with the paper: flat image, LPIPS-VGG fed [0, 1].
     "paper": Protocol("paper", ("psnr", "ssim"), lpips="vgg", lpips_inputs="01", solid_angle=False),
-    # Every direction has the same weight.
+    # Every direction has the same weight; the networks of LPIPS alone see the left and the right edge apart.
     "sphere": Protocol("sphere", ON_THE_SPHERE, lpips="alex", lpips_inputs="11", solid_angle=True),
     # Signs of failed training; `padgs.evaluation.scoring` adds diagnostics and further scores.
     "stability": Protocol("stability", OF_FAILURES, lpips="none", lpips_inputs="11", solid_angle=True),

@@ -30,10 +30,10 @@ def find_model(path: Path) -> Path | None:
     """
     for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
         parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
-        files = ((part, model_files.find_file(part, "images")) for part in parts)
-        sizes = {part: (_count(file), file.stat().st_size) for part, file in files if file}
-        if sizes and (folder != path or model_files.find_file(path, "cameras")):
-            return max(sizes, key=lambda part: sizes[part])
+        files = {part: file for part in parts if (file := model_files.find_file(part, "images"))}
+        if files and (folder != path or model_files.find_file(path, "cameras")):
+            first, *others = files
+            return max(files, key=lambda part: _count(files[part])) if others else first
     return None
 
 
