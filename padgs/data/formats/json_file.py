@@ -36,8 +36,8 @@ class Json:
         return Json(fields[key], f"{key} of {self.where}")
 
     def get(self, key: str) -> Json | None:
-        """Return an optional field; None if absent or null."""
-        return self[key] if self._of(Mapping, "an object").get(key) is not None else None
+        """Return an optional field; None if absent, null or an empty text."""
+        return self[key] if self._of(Mapping, "an object").get(key) not in (None, "") else None
 
     def items(self) -> dict[str, Json]:
         """Return the fields of an object."""

@@ -233,6 +233,15 @@ def test_cameras_of_openmvg_that_no_view_uses_do_not_matter(world: World, tmp_pa
             load(tmp_path)
 
 
+def test_empty_optional_names_are_as_good_as_none(world: World, tmp_path: Path) -> None:
+    def emptied(meta: dict[str, Any]) -> None:
+        meta |= {"ply_file_path": "", "frames": [{**frame, "mask_path": ""} for frame in meta["frames"]]}
+
+    _written(world, tmp_path, emptied)
+    scene = load(tmp_path / "scene")
+    assert scene.train[0].mask() is None and len(scene.points) == len(world.points), "those of sparse_pc.ply"
+
+
 def test_depths_of_nerfstudio_are_not_read_and_it_is_said(world: World, tmp_path: Path) -> None:
     _written(world, tmp_path, lambda meta: [frame.update(depth_file_path="d.png") for frame in meta["frames"]])
     assert any(note.startswith("depth: depth_file_path is not read; ") for note in load(tmp_path / "scene").notes)
