@@ -24,6 +24,8 @@ from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STAT
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
+# Options that results of before they existed do not name, and what those runs did.
+BEFORE = {"method.length_unit": "extent", "train.random_background": False}
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
@@ -52,7 +54,7 @@ def row_of(run: Run) -> tuple[dict[str, Any], ...]:
     numbers = {name: None if (value := of(result)) is None else float(value) for name, of in NUMBERS.items()}
     facts = {name: of(result) for name, of in FACTS.items()}
     metrics = {f"{name}/{metric}": value for name, of in result.scores.items() for metric, value in of.metrics.items()}
-    return facts, dict(_rules(result)), metrics, numbers, dict(flat(result.config))
+    return facts, dict(_rules(result)), metrics, numbers, values_of(result)
 
 
 def _one_line(value: Any) -> Any:
@@ -148,6 +150,11 @@ def decides(key: str) -> bool:
     (True, False)
     """
     return not any(key == other or key.startswith(f"{other}.") for other in WITHOUT_EFFECT)
+
+
+def values_of(result: Result) -> dict[str, Any]:
+    """Return dotted key -> value of the configuration, also of options that are newer than the run."""
+    return {**BEFORE, **dict(flat(result.config))}
 
 
 def setting(config: Mapping[str, Any]) -> str:
@@ -284,7 +291,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "learning_rates": _learning_rates,
     "hardware": _hardware,
     "machine": _machine,
-    "setting": lambda result: setting(dict(flat(result.config))),
+    "setting": lambda result: setting(values_of(result)),
     "smallest": lambda result: _searched(result.smallest),
     "view_psnr": lambda result: _view_psnr(result.scores),
 }
