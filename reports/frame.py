@@ -154,7 +154,8 @@ def decides(key: str) -> bool:
 
 def values_of(result: Result) -> dict[str, Any]:
     """Return dotted key -> value of the configuration, also of options that are newer than the run."""
-    return {**BEFORE, **dict(flat(result.config))}
+    found = dict(flat(result.config))
+    return found | BEFORE | found
 
 
 def setting(config: Mapping[str, Any]) -> str:
