@@ -286,3 +286,27 @@ def test_a_folder_that_cannot_be_written_refuses_all_jobs(tmp_path, capsys):
     start = Start(tmp_path, 1, ELSEWHERE)
     assert start.counts() == {"refused": 3} and start.launched == []
     assert "cannot write run folder" in capsys.readouterr().err
+
+
+def test_a_finished_slurm_job_whose_log_is_not_visible_yet_stays_finished(tmp_path, monkeypatch):
+    submitit = pytest.importorskip("submitit")
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+
+    class Executor:
+        def __init__(self, **_):
+            pass
+
+        def update_parameters(self, **_):
+            pass
+
+        def map_array(self, *_):
+            return ["job", "job"]
+
+    launcher = type("Launcher", (), {"__module__": "submitit", "_EXECUTOR": "slurm"})()
+    launcher.params = {"submitit_folder": str(tmp_path)}
+    monkeypatch.setattr(submitit, "AutoExecutor", Executor)
+    monkeypatch.setattr(sweep, "wait_for_jobs", lambda *_: [0, 1])
+    board = Board(tmp_path / "board")
+    board.write(7, JobState("ok", "room"))
+    sweep.launch(launcher, [["seed=0"], ["seed=1"]], 7, board)
+    assert [board.read(number).status for number in (7, 8)] == ["ok", "stopped"]
