@@ -199,6 +199,8 @@ def test_the_page_has_the_answer_first_then_claims_then_scenes():
         ]
         assert {number: text for number, text, *_ in tables[0]} == claims
         assert [number for number, *_ in tables[1]] == [*claims]
+    failed = replace(made[0], run="failed", seed=9, status="nan", scores={})
+    assert ", failed: nan)" in findings(run_set([*made, failed])).text
     answer, rest = findings(run_set(made)).text.split("## Evidence")
     assert f"| 10 | {claims['10']} | padgs | {FAILS} |" in answer
     assert "| 10 | PSNR | -1.52 | -2.77 to -0.27 | 0.035 | 0 of 3 | – |" in rest

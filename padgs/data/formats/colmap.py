@@ -33,7 +33,7 @@ def find_model(path: Path) -> Path | None:
         files = {part: file for part in parts if (file := model_files.find_file(part, "images"))}
         if files and (folder != path or model_files.find_file(path, "cameras")):
             first, *others = files
-            return max(files, key=lambda part: _count(files[part])) if others else first
+            return max(files, key=lambda part: (_count(files[part]), files[part].stat().st_size)) if others else first
     return None
 
 
