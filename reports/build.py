@@ -22,8 +22,8 @@ PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers 
 # No column if no run has a number
 IF_KNOWN = ("cpu_seconds", "peak_gpu_gigabytes", "sphere/abs_rel", "sphere/delta_1_25")
 SEEN_NOTE = (
-    "Tuned on: settings of methods were chosen on the scene; never seen: nothing had been trained on it when they were "
-    "chosen."
+    "Tuned on: settings of methods were chosen on the scene; never seen: none was, but for the exceptions that the "
+    "limitations name."
 )
 RATES = {"published": "published rates", "run": "rates for the run"}
 

@@ -77,7 +77,7 @@ def test_scenes_tuned_on_and_never_seen_stand_apart():
         "flat (tuned on)",
         "room (tuned on)",
     ]
-    assert "nothing had been trained on it" in "".join(table.notes)
+    assert "never seen: none was, but for the exceptions" in "".join(table.notes)
     assert "tuned" not in markdown(methods(run_set(made[-1:])))
 
 
