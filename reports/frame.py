@@ -25,7 +25,7 @@ from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STAT
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
 # Options that results of before they existed do not name, and what those runs did.
-BEFORE = {"method.length_unit": "extent", "train.random_background": False}
+BEFORE = {"method.length_unit": "extent", "method.means_least_pace": 1.0, "train.random_background": False}
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0

@@ -167,8 +167,7 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
             if found := next((there[key] for key in keys if key in there), None):
                 files[frame.name] = found
         if files:
-            may_be_whole = any(path.suffix.lower() in EXTENSIONS[2:] for path in files.values())
-            return files, _stated(folder / STATEMENT, may_be_whole), notes
+            return files, _stated(folder / STATEMENT, any(map(_may_be_whole, files.values()))), notes
         if there:
             examples = f"{next(iter(there.values())).name} for {capture.frames[0].name}"
             notes.append(f"depth: none of the {len(there)} maps in {folder} is named like an image, such as {examples}")
@@ -177,6 +176,14 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
     others = (path.name for path in sorted(capture.folder.glob("*")) if path.is_dir() and "depth" in path.name.lower())
     notes += [f"depth: {name}/ is not used; name it depths/" for name in others if name.lower() not in FOLDERS]
     return {}, None, notes
+
+
+def _may_be_whole(file: Path) -> bool:
+    """Return whether a depth map may hold integers."""
+    if file.suffix.lower() != ".npy":
+        return file.suffix.lower() != ".exr"
+    with refused_if_damaged(file):
+        return np.load(file, mmap_mode="r", allow_pickle=False).dtype.kind in "iu"
 
 
 def _folded(name: PurePath) -> str:

@@ -86,15 +86,19 @@ def unit_note(folder: Path) -> list[str]:
     return [note] if isinstance(note, str) else []
 
 
+def named(panoramas: Sequence[str], *names: str) -> list[int]:
+    """Return which panoramas the names of --metres are; a DataError for one that has no pose."""
+    at = {name: k for k, full in enumerate(panoramas) for name in (full, view_name(full))}
+    keys = [name if name in at else view_name(name) for name in names]  # "convert" may change the extension
+    if unknown := [name for name, key in zip(names, keys, strict=True) if key not in at]:
+        raise DataError(f"--metres: no panorama with a pose is called {unknown[0]!r}; known: {listed(panoramas)}")
+    return [at[key] for key in keys]
+
+
 def _by_distance(
     frames: Sequence[Frame], poses: Tensor, first: str, second: str, metres: float
 ) -> tuple[Similarity, str]:
-    names = {name: k for k, frame in enumerate(frames) for name in (frame.name, view_name(frame.name))}
-    at = [names.get(name, names.get(view_name(name))) for name in (first, second)]  # "convert" may change the extension
-    for name, index in zip((first, second), at, strict=True):
-        if index is None:
-            known = listed(frame.name for frame in frames)
-            raise DataError(f"--metres: no panorama with a pose is called {name!r}; known: {known}")
+    at = named([frame.name for frame in frames], first, second)
     distance = (centers(poses)[at[0]] - centers(poses)[at[1]]).norm().item()
     extent = (centers(poses) - centers(poses).mean(0)).norm(dim=1).max().item()
     if distance <= 1e-6 * extent:

@@ -167,7 +167,7 @@ class Refined:
     def _rate(self, group: ParameterGroup) -> Callable[[int], float]:
         def rate(step: int) -> float:
             iteration: Any = self._iterations - REPLAYED * (self._iterations - step)  # schedules take floats, too
-            return group.learning_rate(iteration) * (self._pace(iteration) if group.paced else 1.0)
+            return group.rate(iteration, self._pace)
 
         return rate
 

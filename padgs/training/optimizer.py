@@ -99,7 +99,7 @@ class Optimizer:
         """Step Adam at the learning rates of a schedule step, and drop the gradients."""
         self.pace = pace
         for group, settings in zip(self._groups, self.adam.param_groups, strict=True):
-            settings["lr"] = group.learning_rate(step) * (pace(step) if pace and group.paced else 1.0)
+            settings["lr"] = group.rate(step, pace)
         # Adam steps from 0 where rows have factors, so that these act on exact steps.
         scaled = [(part, group.row_rates()) for group in self._groups if group.row_rates for part in group.parameters]
         befores = [part.detach().clone() for part, _ in scaled]

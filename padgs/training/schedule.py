@@ -23,7 +23,12 @@ class ParameterGroup:
     parameters: tuple[nn.Parameter, ...]
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
     paced: bool = True  # whether it follows `Pace`; learned cameras do not
+    least_pace: float = 1.0  # that it begins with, however long the run, if its rates follow from the length
     row_rates: Callable[[], Tensor] | None = None  # factors [N, 1] on the learning rate of rows; None: all are 1
+
+    def rate(self, iteration: int, pace: Callable[[int, float], float] | None) -> float:
+        """Return the learning rate at an iteration; `pace` is a `Pace`, None for published rates."""
+        return self.learning_rate(iteration) * (pace(iteration, self.least_pace) if pace and self.paced else 1.0)
 
 
 @dataclass(frozen=True)
@@ -80,20 +85,21 @@ class Pace:
 
     factor: float
     iterations: int
+    is_law: bool = False  # whether the factor follows from the length
 
     @classmethod
     def of(cls, choice: str | float, iterations: int, schedule: int | None = None) -> Pace:
         """Return the pace of `iterations` by a law or factor; a clock has more `schedule` steps."""
-        if choice in ("run", "run_linear"):
+        if is_law := choice in ("run", "run_linear"):
             is_linear = choice == "run_linear"
             factor = LINEAR_ITERATIONS / iterations if is_linear else math.sqrt(PUBLISHED_ITERATIONS / iterations)
             choice = min(max(factor, 1.0), FASTEST)
-        return cls(1.0 if choice == "published" else float(choice), schedule or iterations)
+        return cls(1.0 if choice == "published" else float(choice), schedule or iterations, is_law)
 
-    def __call__(self, iteration: int) -> float:
-        """Return the factor at an iteration."""
-        t = iteration / self.iterations
-        return self.factor ** min((1 - t) / (1 - SLOWING_FROM), 1.0)
+    def __call__(self, iteration: int, least: float = 1.0) -> float:
+        """Return the factor at an iteration; one that follows from the length begins with `least` or more."""
+        t, factor = iteration / self.iterations, max(self.factor, least) if self.is_law else self.factor
+        return factor ** min((1 - t) / (1 - SLOWING_FROM), 1.0)
 
 
 def scaled(published: int, total: int) -> int:

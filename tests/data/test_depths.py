@@ -183,6 +183,7 @@ def test_a_folder_of_depths_states_what_it_holds(unit: float, world: World, tmp_
             r"is an array of float64 \[4, 8, 3\]; it must",
         ),
         ('{"measure": "ray"}', b"\x93NUMPY", "is cut short or damaged"),
+        ('{"measure": "ray"}', np.full((4, 8), 2500, np.uint16), "does not say what the depth maps hold .*'unit'"),
     ],
 )
 def test_unknown_or_damaged_depths_are_refused(statement, values, message, world: World, tmp_path: Path):

@@ -1,8 +1,9 @@
 import math
+from dataclasses import replace
 
 import pytest
 
-from padgs.training.schedule import FASTEST, PUBLISHED_ITERATIONS, Constant, LogLinear, Pace, scaled
+from padgs.training.schedule import FASTEST, PUBLISHED_ITERATIONS, Constant, LogLinear, Pace, ParameterGroup, scaled
 
 
 def test_log_linear_falls_by_equal_factors_and_stays_at_its_end():
@@ -38,6 +39,17 @@ def test_faster_rates_fade_by_equal_factors_at_the_end():
     assert [pace(i) for i in (1, 599, 600)] == [8.0] * 3
     factors = [pace(i + 50) / pace(i) for i in range(600, 1000, 50)]
     assert factors == pytest.approx([8.0 ** (-1 / 8)] * 8)
+
+
+def test_a_group_begins_with_its_least_pace_where_the_pace_follows_from_the_length():
+    group = ParameterGroup("means", (), Constant(0.1), least_pace=5.0)
+    for iterations, factor in ((700, (30_000 / 700) ** 0.5), (1200, 5.0), (7000, 5.0), (30_000, 5.0)):
+        pace = Pace.of("run", iterations)
+        rates = [group.rate(round(t * iterations), pace) for t in (0, 0.6, 0.8, 1)]
+        assert rates == pytest.approx([0.1 * f for f in (factor, factor, factor**0.5, 1)])
+    assert group.rate(1, Pace.of("published", 7000)) == group.rate(1, None) == 0.1
+    assert group.rate(1, Pace.of(2.0, 7000)) == pytest.approx(0.2)
+    assert replace(group, paced=False).rate(1, Pace.of("run", 7000)) == 0.1
 
 
 def test_windows_follow_the_run_length():

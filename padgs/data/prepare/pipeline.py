@@ -25,7 +25,7 @@ from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
-from padgs.data.metres import UPRIGHT, Z, moved, to_metres, write_unit
+from padgs.data.metres import UPRIGHT, Z, moved, named, to_metres, write_unit
 from padgs.data.prepare import rig, sfm, work
 from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
@@ -117,6 +117,7 @@ class _Job:
             source = self.work / "frames"
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
+            named([*self.source.images], *(options.known.metres or ())[:2])  # a misspelt name, before all work
         first = next(iter(self.source.images.values()))
         self.threads = options.threads or work.threads_for(first.width, first.height)
         kept = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()

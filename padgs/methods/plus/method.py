@@ -65,6 +65,7 @@ class PlusOptions(SplatOptions):
     supersampling_share: float = 0.25  # a shorter run has several if they change its views by this share of the error
     length_unit: str = NEAREST_CAMERA
     means_rate_factor: float = 2.0
+    means_least_pace: float = 5.0  # that of runs of 1200 iterations
     prune_psnr: float | None = PRUNE_PSNR
     coarse_share: float = 0.3  # share of the run on views of half the width or less, if they are large
     smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces; less above 8 views, 0 from 16

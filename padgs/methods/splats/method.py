@@ -45,6 +45,7 @@ class SplatOptions(DensificationOptions, ExtentOptions):
     # each Gaussian, by its distance to the nearest training camera (`padgs.methods.splats.lengths`).
     length_unit: str = EXTENT
     means_rate_factor: float = 1.0  # factor on the learning rate of the means in 3DGS
+    means_least_pace: float = 1.0  # least factor on it by train.learning_rates=run, which longer runs stay at
     prune_psnr: float | None = None  # dB to which the least important are pruned; None: by `budget.gaussians` only
     supersampling_from: float = 0.0  # share of the run with one sample a pixel, before `render.supersampling` acts
     # Variance in square pixels of the finest training view (3D smoothing filter of Mip-Splatting and SPaGS,
@@ -58,7 +59,8 @@ class SplatOptions(DensificationOptions, ExtentOptions):
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "smoothing_filter")
         check(self, "a share of the run in [0, 1)", lambda share: 0 <= share < 1, "supersampling_from")
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
-        check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_rate_factor")
+        factors = ("initial_scale", "means_rate_factor", "means_least_pace")
+        check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, *factors)
         check_known(self, length_unit=LENGTH_UNITS)
         check(self, "> 0 and finite, or none for no pruning", lambda p: p is None or 0 < p < math.inf, "prune_psnr")
         off = "at least 0, which switches it off"
@@ -177,6 +179,7 @@ class SplatMethod(Method):
             prune_psnr=self._prune_psnr(iterations),
             smoothing_filter=options.smoothing_filter,
             means_rate_factor=options.means_rate_factor,
+            means_least_pace=options.means_least_pace,
             supersampling_from=options.supersampling_from,
             length_unit=options.length_unit,
         )

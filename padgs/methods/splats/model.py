@@ -49,6 +49,7 @@ class SplatModel:
         prune_psnr: float | None = None,
         smoothing_filter: float = 0.0,
         means_rate_factor: float = 1.0,
+        means_least_pace: float = 1.0,
         supersampling_from: float = 0.0,
         length_unit: str = EXTENT,
     ) -> None:
@@ -60,7 +61,8 @@ class SplatModel:
         `padgs.methods.splats.method.SplatOptions`.
         """
         self.splats, self.options, self.iterations = splats, options, iterations
-        self._config, self._views, self._extent, self._means_rate_factor = config, views, extent, means_rate_factor
+        self._config, self._views, self._extent = config, views, extent
+        self._means_rate_factor, self._means_least_pace = means_rate_factor, means_least_pace
         self._supersampling_from = supersampling_from
         self._step = 0  # last step of the schedule
         self._lengths = LocalLengths(cameras_of(views)) if length_unit == NEAREST_CAMERA else None
@@ -89,9 +91,10 @@ class SplatModel:
             "sh_dc": Constant(2.5e-3),
             "sh_rest": Constant(2.5e-3 / 20),
         }
-        of_rows = {} if lengths is None else {"means": lambda: lengths.values}
+        of_rows = None if lengths is None else lambda: lengths.values
+        own = {"means": {"least_pace": self._means_least_pace, "row_rates": of_rows}}
         rows = splats.rows()
-        return [ParameterGroup(name, (rows[name],), rate, row_rates=of_rows.get(name)) for name, rate in rates.items()]
+        return [ParameterGroup(name, (rows[name],), rate, **own.get(name, {})) for name, rate in rates.items()]
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians, differentiably; `mean_offsets` of another render get the sum of both gradients."""

@@ -14,6 +14,7 @@ import padgs.data
 from padgs.data import DataError
 from padgs.data.camera_paths import gravity, path_length
 from padgs.data.check import check
+from padgs.data.metres import KnownLength
 from padgs.data.prepare import pipeline, sfm, work
 from padgs.data.prepare.pipeline import prepare
 from padgs.data.prepare.work import PrepareOptions
@@ -51,6 +52,13 @@ def differences(folder, reference):
     exact = torch.stack([reference[frame.name] for frame in frames])
     _, left = align(exact, found)
     return left.distance, left.degrees, path_length(exact)
+
+
+def test_a_misspelt_camera_is_refused_before_any_work(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm, "extract_features", None)
+    name = next(iter(scene[1].glob("*.png"))).name
+    with pytest.raises(DataError, match="--metres: no panorama with a pose is called 'nobody'; known: pano"):
+        prepare(scene[1], tmp_path / "out", PrepareOptions(known=KnownLength(metres=(name, "nobody", 3.0))))
 
 
 def test_a_finished_result_is_reused(scene, prepared):
