@@ -25,7 +25,7 @@ HOLDS, FAILS, MIXED = "holds", "does not hold", "depends on the scene"
 NOT_REPRODUCED = "not reproduced"  # at sizes or lengths that are not the paper's
 UNDECIDED, UNMEASURED = "undecided", "not measured"
 LEAST_SEEDS = 2  # of both sides, for a scene to be tested
-OURS = "padgs"  # source of claims that are not the paper's
+OURS = "this project"  # source of claims that are not the paper's
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def findings(run_set: RunSet) -> Page:
     paper = [one.verdict for one in tested if one.claim.source != OURS]
     every = dict.fromkeys([HOLDS, *sorted(one.verdict for one in tested)])
     numbered = [*enumerate(tested, 1)]
-    verdicts = {verdict: [(no, one.claim) for no, one in numbered if one.verdict == verdict] for verdict in every}
+    verdicts = {verdict: [(no, one) for no, one in numbered if one.verdict == verdict] for verdict in every}
     text = rendered(
         "findings.md.j2",
         paper=paper,

@@ -76,7 +76,7 @@ def test_a_scene_with_one_seed_of_a_side_is_listed_and_not_tested():
 
 def test_verdicts():
     assert verdict(against(*BETTER)) == HOLDS and verdict(against(*WORSE)) == NOT_REPRODUCED
-    assert verdict(against(*WORSE), source="padgs") == FAILS
+    assert verdict(against(*WORSE), source=OURS) == FAILS
     as_published = against(*WORSE, width=1920, height=960, iterations=30_000)
     assert verdict(as_published) == FAILS, "only at the paper's size and length"
     assert verdict(against(WORSE[0], BETTER[0])) == MIXED and verdict(against([0.1, 0.1], [9, 9])) == UNDECIDED
@@ -140,7 +140,7 @@ def test_claims_of_the_paper_are_judged_against_its_own_methods():
         (_, others) = one.sides
         if one.source.startswith("Table") or one.source.startswith("Sec"):
             assert {*others.presets} <= {"egonerf", "op43dgs", "odgs", "omnigs", "spags", "padgs", "padgs_unmodulated"}
-    assert any("spags_sorted" in one.sides[1].presets for one in load() if one.source == "padgs")
+    assert any("spags_sorted" in one.sides[1].presets for one in load() if one.source == OURS)
     assert len(load()) == 12
 
 
@@ -202,7 +202,7 @@ def test_the_page_has_the_answer_first_then_claims_then_scenes():
     failed = replace(made[0], run="failed", seed=9, status="nan", scores={})
     assert ", failed: nan)" in findings(run_set([*made, failed])).text
     answer, rest = findings(run_set(made)).text.split("## Evidence")
-    assert f"| 10 | {claims['10']} | padgs | {FAILS} |" in answer
-    assert "| 10 | PSNR | -1.52 | -2.77 to -0.27 | 0.035 | 0 of 3 | – |" in rest
+    assert f"| 10 | {claims['10']} | {OURS} | {FAILS} | 0 of 3 |" in answer
+    assert "| 10 | PSNR | -1.52 | -2.77 to -0.27 | 0.035 | – |" in rest
     shown = "| 10 | 512x256, 1500 iterations | synthetic-cave -2.05 (OmniGS, corrected, 2/2); synthetic-den -1.45"
     assert shown in rest.split("## Scenes")[1]
