@@ -30,8 +30,7 @@ from padgs.files import open_image
 from padgs.geometry import harmonics
 from padgs.geometry.similarity import Similarity
 from padgs.methods.plus.method import PlusMethod
-from padgs.methods.splats.densification import DensificationOptions
-from padgs.methods.splats.method import SplatMethod
+from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering
@@ -69,7 +68,7 @@ class ExternalMethod(SplatMethod):
     def of(cls, splats: Splats, render: RenderConfig) -> ExternalMethod:
         """Return the method for some Gaussians."""
         method = cls(render=render)
-        method._model = SplatModel(splats, DensificationOptions(), render, extent=1.0, iterations=1)
+        method._model = SplatModel(splats, SplatOptions(), render, extent=1.0, iterations=1)
         return method
 
     def with_renderer(self, render: RenderConfig) -> ExternalMethod:
@@ -77,7 +76,7 @@ class ExternalMethod(SplatMethod):
         other = copy(self)  # not constructed again: it need not be able to draw panoramas
         other.render_config = render
         splats = deepcopy(self.model.splats)
-        other._model = SplatModel(splats, DensificationOptions(), render, extent=1.0, iterations=1)
+        other._model = SplatModel(splats, SplatOptions(), render, extent=1.0, iterations=1)
         return other
 
 

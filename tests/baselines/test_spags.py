@@ -56,16 +56,8 @@ def test_the_published_schedule():
 
 def model_of(scene: Scene, iterations: int = 100) -> SplatModel:
     splats = Splats.from_scene(scene, generator=torch.Generator().manual_seed(0))
-    options = SPaGSOptions()
-    return SplatModel(
-        splats,
-        options,
-        SPaGSMethod.RENDER,
-        extent=1.0,
-        iterations=iterations,
-        views=scene.train,
-        smoothing_filter=options.smoothing_filter,
-    )
+    options, render = SPaGSOptions(), SPaGSMethod.RENDER
+    return SplatModel(splats, options, render, extent=1.0, iterations=iterations, views=scene.train)
 
 
 def test_the_smoothing_filter_is_a_fifth_of_a_square_pixel_of_the_nearest_training_view(scene):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from padgs.baselines import METHODS
 from padgs.checks import lookup
-from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.method import SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering
@@ -26,7 +26,7 @@ class Counted(SplatModel):
 
     def __init__(self, scene) -> None:
         splats = Splats.from_scene(scene, degree=0, generator=torch.Generator().manual_seed(0))
-        super().__init__(splats, DensificationOptions(), RenderConfig(), extent=1.0, iterations=ITERATIONS)
+        super().__init__(splats, SplatOptions(), RenderConfig(), extent=1.0, iterations=ITERATIONS)
         self.drawn, self.steps = [], []
 
     def draw(self, view: View, probe: Tensor | None = None):

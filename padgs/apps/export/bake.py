@@ -16,7 +16,7 @@ from padgs.evaluation.evaluate import quantized
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry import harmonics
 from padgs.methods.anchors.anchors import PaDGS
-from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.method import SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering, RenderOptions, render
@@ -136,7 +136,7 @@ def distill(
         return replace(view, load_pixels=pixels, load_mask=None)
 
     targets = tuple(map(target, scene.train))
-    fixed = DensificationOptions(densify_until=0)
+    fixed = SplatOptions(densify_until=0)
     student = SplatModel(splats, fixed, config, extent=ExtentOptions().extent_of(scene), iterations=steps)
     for record in Trainer(student, replace(scene, train=targets), Budget(steps), DISTILLATION).records():
         progress(record.iteration)

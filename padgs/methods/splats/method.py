@@ -177,9 +177,4 @@ class SplatMethod(Method):
             seed=self.seed,
             requested=self._gaussians,
             prune_psnr=self._prune_psnr(iterations),
-            smoothing_filter=options.smoothing_filter,
-            means_rate_factor=options.means_rate_factor,
-            means_least_pace=options.means_least_pace,
-            supersampling_from=options.supersampling_from,
-            length_unit=options.length_unit,
         )

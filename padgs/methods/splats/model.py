@@ -1,17 +1,19 @@
 """Explicit Gaussians in training: parameters, learning rates and densification as one trainable model."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.methods.splats.densification import MIN_DENSIFY_EVERY, DensificationOptions, Densifier
+from padgs.methods.splats.densification import MIN_DENSIFY_EVERY, Densifier
 from padgs.methods.splats.importance import PruningStep, importance_scores, most_important
-from padgs.methods.splats.lengths import EXTENT, NEAREST_CAMERA, LocalLengths
+from padgs.methods.splats.lengths import NEAREST_CAMERA, LocalLengths
 from padgs.methods.splats.smoothing_filter import SmoothingFilter, cameras_of, finest_pixels, widened
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering, RenderOptions, render
@@ -21,6 +23,9 @@ from padgs.scene import View
 from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.optimizer import keep_rows
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
+
+if TYPE_CHECKING:
+    from padgs.methods.splats.method import SplatOptions
 
 OFFSET_COLUMNS = {"image": 2, "space": 3, "space_absolute": 4}  # of `mean_offsets`, by positional gradient
 FILTER_VARIANCES = "filter/variances"  # key in a state
@@ -37,7 +42,7 @@ class SplatModel:
     def __init__(
         self,
         splats: Splats,
-        options: DensificationOptions,
+        options: SplatOptions,
         config: RenderConfig,
         *,
         extent: float,
@@ -47,25 +52,16 @@ class SplatModel:
         seed: int = 0,
         requested: int | str | None = None,
         prune_psnr: float | None = None,
-        smoothing_filter: float = 0.0,
-        means_rate_factor: float = 1.0,
-        means_least_pace: float = 1.0,
-        supersampling_from: float = 0.0,
-        length_unit: str = EXTENT,
     ) -> None:
         """Wrap splats for a run of `iterations`, with training `views` unless they are only rendered.
 
         `options` are those of a published run; `extent` is in world units; `target` as in `Densifier`; `requested` and
-        `prune_psnr` as in `PruningStep`; `smoothing_filter` is the variance of `SmoothingFilter`, 0 for none; training
-        renders have one sample a pixel before the share `supersampling_from` of the run; `length_unit` as in
-        `padgs.methods.splats.method.SplatOptions`.
+        `prune_psnr` as in `PruningStep`.
         """
         self.splats, self.options, self.iterations = splats, options, iterations
         self._config, self._views, self._extent = config, views, extent
-        self._means_rate_factor, self._means_least_pace = means_rate_factor, means_least_pace
-        self._supersampling_from = supersampling_from
         self._step = 0  # last step of the schedule
-        self._lengths = LocalLengths(cameras_of(views)) if length_unit == NEAREST_CAMERA else None
+        self._lengths = LocalLengths(cameras_of(views)) if options.length_unit == NEAREST_CAMERA else None
         self.densifier = Densifier(
             splats,
             options.for_run(iterations),
@@ -76,13 +72,14 @@ class SplatModel:
             seed=seed,
         )
         self.pruning = PruningStep(self.densifier.options, requested=requested, prune_psnr=prune_psnr)
-        self._filter = SmoothingFilter(smoothing_filter, cameras_of(views)) if smoothing_filter > 0 else None
+        variance = options.smoothing_filter
+        self._filter = SmoothingFilter(variance, cameras_of(views)) if variance > 0 else None
         self._follow()
 
     def groups(self) -> list[ParameterGroup]:
         """Return the learning rates of 3DGS; that of the means decays over the run and scales with `length_unit`."""
         splats, lengths = self.splats, self._lengths
-        factor = self._means_rate_factor * (self._extent if lengths is None else 1.0)
+        factor = self.options.means_rate_factor * (self._extent if lengths is None else 1.0)
         rates = {
             "means": LogLinear(1.6e-4 * factor, 1.6e-6 * factor, self.iterations),
             "quats": Constant(1e-3),
@@ -92,7 +89,7 @@ class SplatModel:
             "sh_rest": Constant(2.5e-3 / 20),
         }
         of_rows = None if lengths is None else lambda: lengths.values
-        own = {"means": {"least_pace": self._means_least_pace, "row_rates": of_rows}}
+        own = {"means": {"least_pace": self.options.means_least_pace, "row_rates": of_rows}}
         rows = splats.rows()
         return [ParameterGroup(name, (rows[name],), rate, **own.get(name, {})) for name, rate in rates.items()]
 
@@ -104,7 +101,7 @@ class SplatModel:
             offsets = splats.means.new_zeros(len(splats), OFFSET_COLUMNS[kind], requires_grad=True)
         gaussians, absolute = splats.displaced(view, None if kind == "image" else offsets)
         gaussians, options = self._training_gaussians(gaussians), self.render_options(view)
-        if self._step < self._supersampling_from * self.iterations:
+        if self._step < self.options.supersampling_from * self.iterations:
             options = replace(options, supersampling=1)
         if kind == "image":
             rendering = self._rendered(gaussians, view, options, mean_offsets=offsets)

@@ -5,6 +5,7 @@ import torch
 
 from padgs.gaussians import rotation_matrices
 from padgs.methods.splats.densification import DensificationOptions, Densifier
+from padgs.methods.splats.method import SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
@@ -203,7 +204,7 @@ def test_a_reset_limits_the_opacity_that_the_nearest_camera_draws(kind, generato
     views = [View("v", torch.eye(4), width, width // 2) for _ in centers]
     for view, center in zip(views, centers, strict=True):
         view.cam_from_world[:3, 3] = -center
-    options = DensificationOptions(densify_from=10**6, reset_every=3000, reset_opacity=0.1)
+    options = SplatOptions(densify_from=10**6, reset_every=3000, reset_opacity=0.1)
     render = RenderConfig(projection="ray", low_pass=0.2, low_pass_kind=kind)
     trained = SplatModel(splats, options, render, extent=1.0, iterations=30_000, views=views)
     trained.adapt(3000, torch.optim.Adam(splats.parameters()))

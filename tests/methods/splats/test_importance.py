@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from padgs.geometry.camera import perspective
-from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.importance import (
     MIN_KEPT_SHARE,
     Importance,
@@ -14,6 +13,7 @@ from padgs.methods.splats.importance import (
     importance_scores,
     most_important,
 )
+from padgs.methods.splats.method import SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
@@ -45,5 +45,5 @@ def test_all_pixels_of_a_perspective_view_weigh_the_same():
     means = torch.tensor([[0.0, -0.8, 1.0], [0.8, 0.0, 1.0]])
     splats = Splats(means, torch.full((2, 3), math.log(0.1)), torch.ones(2, 3), degree=0)
     config = RenderConfig(projection="ray")
-    found = importance_scores(SplatModel(splats, DensificationOptions(), config, extent=1.0, iterations=10), (view,))
+    found = importance_scores(SplatModel(splats, SplatOptions(), config, extent=1.0, iterations=10), (view,))
     assert found.change[0].item() == pytest.approx(found.change[1].item(), rel=1e-3) and found.change[0] > 0

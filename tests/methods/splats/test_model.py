@@ -8,8 +8,7 @@ from support.composed import composed
 from support.rates import assert_log_linear
 from support.tiny_scene import tiny_scene
 
-from padgs.methods.splats.densification import DensificationOptions
-from padgs.methods.splats.method import SplatMethod
+from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
@@ -34,7 +33,7 @@ LENGTHS = {"means": EXTENT}  # what a rate is multiplied by
 
 def trainable(iterations: int = PUBLISHED_ITERATIONS) -> SplatModel:
     splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
-    return SplatModel(splats, DensificationOptions(), RenderConfig(), extent=EXTENT, iterations=iterations)
+    return SplatModel(splats, SplatOptions(), RenderConfig(), extent=EXTENT, iterations=iterations)
 
 
 def travelling(scene: Scene, times: float) -> Scene:
@@ -141,8 +140,8 @@ def test_training_renders_have_more_samples_late_in_the_run():
     def model_with(supersampling: int, share: float) -> SplatModel:
         splats = Splats.from_scene(scene, generator=torch.Generator())
         config = RenderConfig(projection="ray", supersampling=supersampling)
-        options = DensificationOptions(densify_from=1000)
-        return SplatModel(splats, options, config, extent=EXTENT, iterations=10, supersampling_from=share)
+        options = SplatOptions(densify_from=1000, supersampling_from=share)
+        return SplatModel(splats, options, config, extent=EXTENT, iterations=10)
 
     model, optimizer = model_with(2, 0.6), torch.optim.Adam([torch.zeros(1, requires_grad=True)])
     one, four = (model_with(times, 0.0).render(view).image for times in (1, 2))

@@ -8,7 +8,6 @@ import torch
 
 from padgs.gaussians import rotation_matrices
 from padgs.geometry.panorama import direction
-from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
@@ -31,7 +30,7 @@ def colored_splats(count: int, generator: torch.Generator) -> Splats:
 def drawn(splats: Splats, view: View, kind: str, **config) -> tuple[Rendering, torch.Tensor]:
     """A training render by the torch backend, and its mean offsets, whose gradient is the positional gradient."""
     render_config = RenderConfig(backend="torch", near=0.0, **config)
-    options = DensificationOptions(positional_gradient=kind)
+    options = SplatOptions(positional_gradient=kind)
     drawing = SplatModel(splats, options, render_config, extent=1.0, iterations=100).draw(view)
     return drawing.rendering, drawing.mean_offsets
 
@@ -135,9 +134,7 @@ def test_space_absolute_adds_half_the_distance_times_the_absolute_gradients_of_p
 @pytest.mark.parametrize(("kind", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
 def test_the_densifier_observes_the_gradient_of_its_options(kind, axes, generator):
     splats, render_config = colored_splats(10, generator), RenderConfig(backend="torch", projection="ray")
-    model = SplatModel(
-        splats, DensificationOptions(positional_gradient=kind), render_config, extent=1.0, iterations=100
-    )
+    model = SplatModel(splats, SplatOptions(positional_gradient=kind), render_config, extent=1.0, iterations=100)
     drawing = model.draw(view_at(generator))
     drawing.rendering.image.sum().backward()
     assert drawing.mean_offsets.grad is not None and drawing.mean_offsets.grad.shape == (10, axes)

@@ -16,7 +16,8 @@ from torch import Tensor
 from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.method import AnchorModel
-from padgs.methods.splats.densification import POSITIONAL_GRADIENTS, DensificationOptions
+from padgs.methods.splats.densification import POSITIONAL_GRADIENTS
+from padgs.methods.splats.method import SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.native import LIBRARIES, cuda
@@ -108,7 +109,7 @@ def test_splat_iterations_do_not_wait(kind: str):
         seen = work.model.decode(work.view).gaussians
     splats = Splats(seen.means, seen.scales.log(), seen.colors, degree=3)
     splats.active_degree = 3
-    options, config = DensificationOptions(positional_gradient=kind), RenderConfig("ray", backend="cuda")
+    options, config = SplatOptions(positional_gradient=kind), RenderConfig("ray", backend="cuda")
     with pretended_gpu() as waits, call_hook(stage_of(called := [])):
         model = SplatModel(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
         scene, train = resident(work.scene, GPU), TrainOptions(random_background=True)
