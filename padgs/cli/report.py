@@ -2,14 +2,12 @@
 
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import show
+from padgs.cli.errors import name_place, show
 from padgs.reports import REPORTS, store
 from padgs.reports.table import ReportError
 from padgs.results import FILE_NAME, STOP_REQUESTED
@@ -47,7 +45,7 @@ def report(
     request = Request(protocol, mix, strict, experiment=experiment, where=_pairs(where), **names)
     found, broken = store.read(source)
     if collect:
-        with _writing_to(target):
+        with name_place(target, "--out"):
             target.mkdir(parents=True, exist_ok=True)
             found = store.add(found, target / store.FILE_NAME)  # only runs in `source` have pictures
     for error in broken:
@@ -72,7 +70,7 @@ def report(
             continue
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
-        with _writing_to(target):
+        with name_place(target, "--out"):
             write_files(texts, target)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
@@ -84,15 +82,6 @@ def report(
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):
         raise typer.Exit(1)
-
-
-@contextmanager
-def _writing_to(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        why = error.strerror or error
-        raise ReportError(f"cannot write to {folder}: {why}; name another folder with --out") from error
 
 
 def _listed(values: list[str] | None) -> tuple[str, ...]:

@@ -14,11 +14,11 @@ from torch import Tensor
 from padgs.data.camera_paths import centers
 from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, refuse_special
 from padgs.files import atomic_path
+from padgs.geometry.harmonics import DC
 
 CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, after one of the prefixes; any case
 PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
-SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 1/2 + SH_C0 f_dc
-SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0
+SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 1/2 + DC f_dc
 NO_FILE = ("auto", "random")  # values of `data.points` that name no file
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
@@ -40,7 +40,7 @@ def read_ply(path: Path) -> Cloud:
     packed = next((name for name in ("rgb", "rgba") if name in stored), None)
     colors = None
     if channels and channels[0].endswith(SH_CHANNELS[0]):
-        colors = color_bytes((0.5 + SH_C0 * columns(*channels)).clip(0, 1), str(path))
+        colors = color_bytes((0.5 + DC * columns(*channels)).clip(0, 1), str(path))
     elif channels:
         colors = color_bytes(columns(*channels), str(path))
     elif packed and (bits := columns(packed)).itemsize == 4:  # PCL: 0xAARRGGBB, stored as an integer or a float
