@@ -51,7 +51,7 @@ def test_budget_auto_works_with_learned_exposures():
 TUNED = {
     **{"sh_degree": 2, "initial_per_pixel": 0.6, "depth_init_per_pixel": 0.6, "sky_per_point": 0.5},
     **{"split": "long_axis", "initial_opacity": 0.5, "initial_scale": 0.6},
-    **{"means_rate_factor": 2.0, "means_least_pace": 5.0, "prune_psnr": 44.0},
+    **{"means_rate_factor": 2.0, "prune_psnr": 44.0},
 }
 
 
