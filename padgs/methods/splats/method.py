@@ -15,7 +15,7 @@ from padgs.checks import check, check_known
 from padgs.geometry.harmonics import MAX_DEGREE
 from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.depth_initialization import far_gaussians, fill_sparse_cloud, room_count, solid_angle_pixels
-from padgs.methods.splats.importance import GROWN_PER_KEPT, RECOVERY, pruning_iteration
+from padgs.methods.splats.importance import GROWN_PER_KEPT, RECOVERY, RECOVERY_SHARE, pruning_iteration
 from padgs.methods.splats.lengths import EXTENT, LENGTH_UNITS
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import INITIAL_OPACITY, Splats
@@ -148,7 +148,7 @@ class SplatMethod(Method):
         """Return the PSNR of the pruning step; None: there is none, as training would not recover from it."""
         due = pruning_iteration(self.options.for_run(iterations))
         asked = self.options.prune_psnr or (PRUNE_PSNR if self._gaussians == AUTO else None)
-        return asked if due + RECOVERY <= iterations else None
+        return asked if iterations - due >= max(RECOVERY, RECOVERY_SHARE * iterations) else None
 
     def _target(self, iterations: int) -> int | None:
         """Return the number that densification aims at: that of the budget, if it is one; twice that before pruning."""

@@ -7,17 +7,15 @@ import torch
 from support.composed import composed
 from support.tiny_scene import tiny_scene
 
-from padgs.baselines import METHODS
-from padgs.checks import lookup
 from padgs.multirun.composition import make_method
 from padgs.training.options import Budget
 
 
 @pytest.mark.parametrize("name", ["omnigs", "spags", "cubemap_3dgs"])
 def test_budget_auto_prunes_once_after_densification(name):
-    method = lookup(METHODS, name, "method")()
+    method = make_method(name, "train.monitor=false")  # a scene this small diverges after it
     counts, events = [], []
-    for record in method.fit(tiny_scene(), Budget(300, gaussians="auto")):
+    for record in method.fit(tiny_scene(), Budget(450, gaussians="auto")):
         counts.append(record.counts["gaussians"])
         events += [(record.iteration, event) for event in record.events if "least important" in event]
     ((iteration, event),) = events
@@ -75,7 +73,7 @@ def test_every_explicit_method_takes_the_options_of_padgs_plus(name):
     tiny = tiny_scene()
     points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
     scene = replace(tiny, points=points, point_colors=tiny.point_colors.repeat(10, 1))
-    method.fit(scene, Budget(300))
+    method.fit(scene, Budget(450))
     model = method.model
     far = model.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
     assert method.start == 0.1 * 2000 + far.sum() and far.any(), "points and sky"
@@ -90,7 +88,8 @@ def test_every_explicit_method_takes_the_options_of_padgs_plus(name):
 @pytest.mark.parametrize("name", ["padgs_plus", "spags_tuned"])
 def test_nothing_is_pruned_that_training_cannot_recover(name, gaussians):
     method = make_method(name, f"budget.gaussians={gaussians or 'null'}")
-    for iterations in (60, 150, 170, 181, 182, 199, 200, 299, 300, 1000):
+    for iterations in (60, 150, 170, 181, 182, 200, 300, 416, 417, 1000):
         method.fit(tiny_scene(), Budget(iterations, gaussians=gaussians))
         step = method.model.pruning
-        assert step.is_ahead(0) == (step.due + 100 <= iterations) == step.is_due(step.due), iterations
+        left = iterations - step.due
+        assert step.is_ahead(0) == (left >= max(100, 0.38 * iterations)) == step.is_due(step.due), iterations
