@@ -23,11 +23,11 @@ class ParameterGroup:
     parameters: tuple[nn.Parameter, ...]
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
     paced: bool = True  # whether it follows `Pace`; learned cameras do not
-    least_pace: float = 1.0  # that it begins with, however long the run, if its rates follow from the length
+    least_pace: float = 1.0  # lower bound of the factor that `Pace` begins with, where that follows from the length
     row_rates: Callable[[], Tensor] | None = None  # factors [N, 1] on the learning rate of rows; None: all are 1
 
-    def rate(self, iteration: int, pace: Callable[[int, float], float] | None) -> float:
-        """Return the learning rate at an iteration; `pace` is a `Pace`, None for published rates."""
+    def rate(self, iteration: int, pace: Pace | None) -> float:
+        """Return the learning rate at an iteration; without a pace the published one."""
         return self.learning_rate(iteration) * (pace(iteration, self.least_pace) if pace and self.paced else 1.0)
 
 

@@ -8,7 +8,9 @@ from support.composed import composed
 from support.tiny_scene import tiny_scene
 
 from padgs.multirun.composition import make_method
+from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget
+from padgs.training.schedule import Pace
 
 
 @pytest.mark.parametrize("name", ["omnigs", "spags", "cubemap_3dgs"])
@@ -93,3 +95,14 @@ def test_nothing_is_pruned_that_training_cannot_recover(name, gaussians):
         step = method.model.pruning
         left = iterations - step.due
         assert step.is_ahead(0) == (left >= max(100, 0.38 * iterations)) == step.is_due(step.due), iterations
+
+
+@pytest.mark.parametrize(("name", "least"), [("padgs_plus", 5.0), ("spags_tuned", 1.0)])
+def test_means_of_padgs_plus_alone_keep_their_pace_in_long_runs(name, least):
+    model, pace = make_method(name).build_model(tiny_scene(), 7000), Pace.of("run", 7000)
+    published = {group.name: group.learning_rate(1) for group in model.groups()}
+    optimizer = Optimizer(model.groups(), check_every=50)
+    optimizer.step(1, pace)
+    factors = {group["name"]: group["lr"] / published[group["name"]] for group in optimizer.adam.param_groups}
+    assert 2 < pace.factor < 5 and factors.pop("means") == pytest.approx(max(least, pace.factor))
+    assert [*factors.values()] == pytest.approx([pace.factor] * len(factors)) and factors
