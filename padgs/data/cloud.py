@@ -1,5 +1,6 @@
 """Point clouds: PLY files through plyfile, and the cloud from which training starts."""
 
+import math
 import re
 from collections.abc import Sequence
 from io import BytesIO
@@ -22,6 +23,7 @@ SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 
 NO_FILE = ("auto", "random")  # values of `data.points` that name no file
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
+VISIBLE_STEP = 0.002  # of the median distance of points from their middle
 GREY, GREY_POINTS = 128, "points: the cloud has no colours; grey is used"
 
 
@@ -157,10 +159,24 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
     if bad := (~(points.abs() <= FARTHEST).all(1)).sum().item():
         rule = f"not finite, or farther than {FARTHEST:g} from the origin"
         raise DataError(f"{bad} of {len(points)} points of {where} are {rule}; remove them from the cloud")
+    notes = (*notes, *_rounded(points, where))
     if colors is None or not colors.any():  # black is what scanners without a camera write
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
         notes = (*notes, GREY_POINTS)
     return points.double(), colors, notes
+
+
+def _rounded(points: Tensor, where: str) -> tuple[str, ...]:
+    """Return a note if 32-bit floats have rounded the points [P, 3] to steps that show at the size of their cloud.
+
+    Such are map coordinates in most PLY files: at 5 400 000 m a step is half a metre.
+    """
+    far, spread = points.abs().max().item(), (points - points.median(0).values).norm(dim=1).median().item()
+    step = 2.0 ** (math.floor(math.log2(max(far, 1e-30))) - 23)
+    if not 0 < VISIBLE_STEP * spread < step or not torch.equal(points, points.float().double()):
+        return ()
+    rule = f"32-bit floats, which round coordinates of {far:.7g} to steps of {step:.2g}"
+    return (f"points: those of {where} are {rule}; export the cloud with 64-bit coordinates, or in a nearby frame",)
 
 
 def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:

@@ -166,6 +166,24 @@ def test_text_keeps_the_digits_of_map_coordinates(tmp_path: Path) -> None:
     assert read_ply(tmp_path / "map.ply").points.tolist() == [[691000.123, 5399999.985, 520.25], [0, 1, 2]]
 
 
+@pytest.mark.parametrize(
+    ("corner", "size", "kind", "noted"),
+    [
+        (5.4e6, 30, "f4", True),  # steps of 0.5
+        (5.4e6, 30, "f8", False),
+        (5.4e6, 3000, "f4", False),  # a town
+        (30, 3, "f4", False),
+        (1e-3, 1e-9, "f4", True),  # the same in another unit
+        (0, 0, "f4", False),  # a single place
+    ],
+)
+def test_rounded_points_are_noted(tmp_path: Path, corner: float, size: float, kind: str, noted: bool) -> None:
+    places = corner + size * np.random.default_rng(0).random((50, 3))
+    path = _write(tmp_path / "a.ply", {axis: (kind, list(places[:, k])) for k, axis in enumerate("xyz")})
+    _, _, notes = initial_cloud(Capture("made", tmp_path, tmp_path, (), read_ply(path)), "a.ply")
+    assert any("a.ply are 32-bit floats, which round" in note for note in notes) == noted
+
+
 def test_points_beyond_what_can_be_rendered_are_refused(tmp_path: Path) -> None:
     for far in (1e16, float("nan"), float("inf"), -1e300):
         cloud = Cloud(torch.tensor([[0.0, 0, 1], [0, far, 0]], dtype=torch.float64), None)

@@ -33,6 +33,8 @@ _WAYS_OUT = (  # suffixes of unsupported files, and what to do with them
 )
 DECODED = 3  # images checked for dual fisheye; images of one camera are alike
 _HDR_TRANSFER = {8: "linear", 16: "PQ", 18: "HLG"}  # numbers of ITU-T H.273
+_UNTAGGED = 2  # number of H.273 for colours that the video does not state
+_SD_HEIGHT = 576  # pixels; players take taller untagged videos as BT.709, FFmpeg's conversion all as BT.601
 _ONE_PANORAMA = {  # of FFmpeg's metadata of frames: first numbers, and what to do with a video that has others
     "SPHERICAL": ((0,), "in another projection than equirectangular: convert it"),
     "STEREO3D": ((0,), "stereo: export one eye"),
@@ -104,7 +106,8 @@ def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
             numbers, otherwise = _ONE_PANORAMA[side.type.name]
             if tuple(np.frombuffer(bytes(side), np.int32, len(numbers)).tolist()) != numbers:
                 raise DataError(f"{video} says that it is {otherwise}")
-    return frame.to_ndarray(format="rgb24")
+    is_hd = frame.height > _SD_HEIGHT and frame.colorspace == _UNTAGGED
+    return frame.to_ndarray(format="rgb24", src_colorspace="ITU709" if is_hd else None)
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:

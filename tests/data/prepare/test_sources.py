@@ -174,6 +174,15 @@ def test_frames_are_chosen_by_time_at_a_variable_rate(tmp_path):
     assert [int((value - 38) / 25) for value in brightness] == [*range(8)]
 
 
+@pytest.mark.parametrize(("height", "matrix"), [(576, "ITU601"), (578, "ITU709")])
+def test_untagged_videos_have_the_colours_that_players_show(tmp_path, height, matrix):
+    av, painted = pytest.importorskip("av", reason="the extra `video` is not installed"), (200, 60, 40)
+    pixels = np.full((height, 2 * height, 3), painted, np.uint8)
+    frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p", dst_colorspace=matrix)
+    frame.colorspace = 2
+    assert np.abs(_pixels(frame, Path("a.mp4"))[::50, ::50].astype(int) - painted).max() <= 2
+
+
 @pytest.mark.parametrize(
     ("name", "numbers", "message"),
     [
@@ -189,7 +198,8 @@ def test_videos_that_are_not_upright_panoramas_of_one_eye_are_refused(name, numb
 
     def frame(*numbers, transfer=1):
         side_data = [Side(np.array(numbers, np.int32).tobytes())]
-        return SimpleNamespace(color_trc=transfer, side_data=side_data, to_ndarray=lambda format: "pixels")
+        shared = {"height": 64, "colorspace": 1, "to_ndarray": lambda **_: "pixels"}
+        return SimpleNamespace(color_trc=transfer, side_data=side_data, **shared)
 
     with pytest.raises(DataError, match=f"a.mp4 says that it is {message}"):
         _pixels(frame(*numbers), Path("a.mp4"))
