@@ -25,6 +25,7 @@ from padgs.runs.config import (
     RunConfig,
     config_from_values,
     default_fields,
+    gpus_for,
     method_choices,
     method_fields,
     scene_choices,
@@ -42,6 +43,7 @@ def _itself(store: ConfigStore, _: dict) -> ConfigStore:
 ConfigStore.__deepcopy__ = _itself  # type: ignore[attr-defined]
 # At import, because jobs in processes of their own resolve what was composed elsewhere.
 OmegaConf.register_new_resolver("is_dataset", lambda name, *, _root_: _root_.data.dataset == name, replace=True)
+OmegaConf.register_new_resolver("gpus_for", gpus_for, replace=True)
 _registered: list[tuple[Path, dict[str, Any]]] = []  # folder of `conf`, and methods, whose choices Hydra knows
 
 

@@ -276,6 +276,11 @@ def scene_choices() -> dict[str, dict[str, Any]]:
     return {name: {"defaults": [{"override /data": data}], "data": keys} for name, (data, keys) in values.items()}
 
 
+def gpus_for(device: str) -> int:
+    """Return the number of GPUs that a run with this `run.device` asks a cluster for; auto: 1 if this machine has one."""
+    return int(device == "cuda" or (device == "auto" and torch.cuda.is_available()))
+
+
 def choose_device(name: str, render: RenderConfig) -> torch.device:
     """Return the device for `run.device`; auto: a GPU that can render these settings (else a warning), or the CPU."""
     if (name == "cuda" or render.backend == "cuda") and not torch.cuda.is_available():

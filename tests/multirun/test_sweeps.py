@@ -13,6 +13,7 @@ from support.tiny_run import SMALLEST, finish
 
 from padgs import results
 from padgs.checks import ConfigError
+from padgs.multirun.overrides import root
 from padgs.multirun.sweep import sweep
 
 TINY = [*SMALLEST, "train.iterations=40", "run.checkpoint_every=5", "tracking=none"]
@@ -33,6 +34,16 @@ def test_an_unknown_key_of_tracking_is_refused(tmp_path):
     config = {"run": {"folder": str(tmp_path)}, "retry": "none", "tracking": {"knid": "none"}, "hydra": hydra}
     with pytest.raises(ConfigError, match="unknown key tracking.knid; known: tracking.kind.*did you mean"):
         sweep(OmegaConf.create(config), Mock())
+
+
+@pytest.mark.parametrize(
+    ("device", "here", "asked"), [("cuda", False, 1), ("auto", True, 1), ("auto", False, 0), ("cpu", True, 0)]
+)
+def test_runs_of_ray_ask_for_the_gpu_that_they_use(monkeypatch, device, here, asked):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: here)
+    ray = OmegaConf.load(root() / "conf" / "launcher" / "ray.yaml")
+    config = OmegaConf.merge(ray, {"run": {"device": device, "threads": 3}})
+    assert config.hydra.launcher.ray.remote == {"num_cpus": 3, "num_gpus": asked}
 
 
 @pytest.mark.slow
