@@ -277,7 +277,7 @@ def scene_choices() -> dict[str, dict[str, Any]]:
 
 
 def gpus_for(device: str) -> int:
-    """Return the number of GPUs that a run with this `run.device` asks a cluster for; auto: 1 if this machine has one."""
+    """Return how many GPUs a run with this `run.device` asks a cluster for; auto: 1 if this machine has one."""
     return int(device == "cuda" or (device == "auto" and torch.cuda.is_available()))
 
 
