@@ -123,7 +123,8 @@ def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
     """Test whether the mean advantages differ from zero: paired t-tests on the scenes' means over seeds, with Holm's
     correction for all tested claims of the paper, and apart for all of this project.
 
-    A claim holds (is not reproduced) if the mean is significantly positive (negative), and every scene is likewise.
+    A claim holds (is not reproduced) if the mean is significantly positive (negative), and no scene is otherwise beyond
+    the noise of seeds.
     """
     found = [Evidence(claim, measured(claim, run_set)) for claim in claims]
     found = [replace(one, p=paired_test([*one.tested["advantage"]])[0]) if one.interval else one for one in found]
@@ -146,7 +147,7 @@ def _verdict(evidence: Evidence) -> str:
     beyond_seeds = advantages[evidence.tested["differs"]]
     if (beyond_seeds > 0).any() and (beyond_seeds < 0).any():
         return MIXED
-    if not evidence.p < 1 - CONFIDENCE or ((advantages > 0) != (advantages.mean() > 0)).any():
+    if not evidence.p < 1 - CONFIDENCE or ((beyond_seeds > 0) != (advantages.mean() > 0)).any():
         return UNDECIDED
     if advantages.mean() > 0:
         return UNDECIDED if evidence.scenes["failed"].any() else HOLDS

@@ -22,7 +22,7 @@ from padgs.reports.claims import (
 )
 from padgs.reports.methods import title
 
-SCENES = ("synthetic-room", "synthetic-cave", "synthetic-den")
+SCENES = ("synthetic-room", "synthetic-cave", "synthetic-den", "synthetic-hut", "synthetic-loft", "synthetic-shed")
 BETTER, WORSE = ([1, 1.1], [2, 2.1], [1.5, 1.4]), ([-1, -1.1], [-2, -2.1], [-1.5, -1.4])
 NOT_REPRODUCED = "not reproduced at 512x256"
 
@@ -81,6 +81,10 @@ def test_verdicts():
     assert verdict(as_published) == FAILS, "only at the paper's size and length"
     assert verdict(against(WORSE[0], BETTER[0])) == MIXED and verdict(against([0.1, 0.1], [9, 9])) == UNDECIDED
     assert verdict(against([-2, 1.8], BETTER[0])) == UNDECIDED, "scenes disagree within the noise of seeds"
+    assert verdict(against(*BETTER, *BETTER[1:], [-0.4, 0.3])) == HOLDS, (
+        "a scene within the noise of seeds is no contradiction"
+    )
+    assert verdict(against(*BETTER, *BETTER[1:], [-0.05, -0.051])) == MIXED
     assert verdict([]) == UNMEASURED == verdict(runs([1, 2]))
     assert verdict(against(*BETTER), scenes="outdoor") == UNMEASURED
 
