@@ -24,13 +24,8 @@ class EgoNeRFMethod(Method):
 
     def refuse_budget(self, budget: Budget) -> None:
         super().refuse_budget(budget)
-        if budget.gaussians is not None:
-            raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
         if budget.stop == "auto":
             raise ValueError("budget.stop is auto, which needs validation views, but rays come from all; set it to end")
-
-    def refuse_search(self) -> None:
-        raise ValueError("egonerf has no Gaussians to prune, so it has no smallest model; take a method with Gaussians")
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
         return EgoNeRFModel(EgoNeRF.from_scene(scene, self.options, self.seed), iterations)

@@ -131,6 +131,15 @@ def test_a_sweep_of_too_many_jobs_is_refused():
                 expand({}, settings, loader)
 
 
+@pytest.mark.parametrize("setting", ["+scene=glob(roam36_*)", "seed=range(5,1)"])
+def test_a_sweep_of_nothing_is_refused(setting):
+    with (
+        composing() as loader,
+        pytest.raises(ValueError, match=f"^{re.escape(setting)} has no value; correct the name"),
+    ):
+        expand({}, [setting], loader)
+
+
 def test_the_tables_of_the_paper_are_all_of_its_scenes_times_all_of_its_methods():
     for name, known in (("table1_360roam", "roam360"), ("table2_ricoh360", "ricoh360")):
         pairs = [dict(setting.split("=") for setting in job) for job in expanded(f"+experiment={name}")]
@@ -196,11 +205,6 @@ def test_several_folders_are_several_jobs():
 
 def test_an_array_of_slurm_is_no_longer_than_it_allows_by_itself():
     assert OmegaConf.load(CONF / "launcher" / "slurm.yaml").hydra.sweeper.max_batch_size <= 1001
-
-
-def test_a_task_of_ray_has_a_core_for_each_of_its_threads():
-    config = OmegaConf.load(CONF / "launcher" / "ray.yaml")
-    assert config.hydra.launcher.ray.remote.num_cpus == config.run.threads
 
 
 @pytest.mark.parametrize("name", ["none", "local", "slurm", "submitit", "ray"])

@@ -26,7 +26,7 @@ from padgs.data.formats.path_file import TRANSFORMS
 from padgs.data.formats.transforms import transforms_file
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import STABILITY, Render, frame_times, score
-from padgs.files import open_image
+from padgs.files import DAMAGE, open_image
 from padgs.geometry import harmonics
 from padgs.geometry.similarity import Similarity
 from padgs.methods.plus.method import PlusMethod
@@ -256,6 +256,10 @@ class Renders:
                     )
                 if image.mode not in ("RGB", "L", "P", "1") or "transparency" in image.info:
                     raise DataError(f"{path} has pixels of type {image.mode}; save 8-bit RGB without transparency")
+                try:
+                    image.load()
+                except DAMAGE as error:
+                    raise DataError(f"{path} is damaged ({error}); render it again") from error
         extra = tuple(str(file.relative_to(folder)) for file in sorted(there) if file.suffix == ".png")
         return cls(files, extra)
 

@@ -3,6 +3,7 @@
 `load(path)` detects the format; `Scene.notes` says what was decided and why.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -79,8 +80,9 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         notes = (f"format: {format}, read by {package.name} {package.version}",) if package else ()
     if format == "synthetic":
         raise DataError(f"{path}: synthetic scenes are made, not read from a folder; give another format, or auto")
+    reader = lookup(LOADERS, format, "data.format")
     try:
-        capture = lookup(LOADERS, format, "data.format")(path, options)
+        capture = reader(path, options)
     except DataError as error:
         if not any(OTHERS in note for note in notes):
             raise
@@ -89,6 +91,10 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
     capture = replace(capture, mask=mask, notes=(*notes, *capture.notes))
+    if options.points != "auto" and any(not one.axes.equal(capture.readings[0].axes) for one in capture.readings):
+        with suppress(DataError):  # if its own points cannot be read, nothing says how its images are turned
+            own = best_reading(found_images(reader(path, replace(options, points="auto"))))
+            capture = replace(capture, frames=own.frames, notes=(*notes, *own.notes), readings=())
     if options.points not in NO_FILE:  # before its frame is chosen; tracks belong to the capture's own points
         cloud, notes = read_cloud(capture.folder / options.points)
         capture = replace(capture, cloud=cloud, tracks=None, notes=(*capture.notes, *notes))

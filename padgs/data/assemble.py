@@ -6,13 +6,24 @@ import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path, PurePosixPath
 
 import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, Frame, first_of, listed, view_name
+from padgs.data.capture import (
+    OTHERS,
+    Capture,
+    DataError,
+    DataOptions,
+    Frame,
+    UnknownLens,
+    first_of,
+    listed,
+    view_name,
+)
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
@@ -35,11 +46,14 @@ SKIPPED = ((PREPARED,), ("config.yaml", "renders"))
 
 def assemble(capture: Capture, options: DataOptions) -> Scene:
     """Build the scene of a capture; a DataError if training cannot use it. Images are checked, but not decoded."""
+    capture = _without_unlisted(capture, options)
     # Panoramas first: the first view stands for all where only one is looked at.
     frames = sorted(capture.frames, key=lambda frame: (frame.lens is not None, frame.name))
     panoramas = sum(frame.lens is None for frame in frames)
     left_out = options.cameras == "panoramas"
     capture = replace(capture, frames=tuple(frames[:panoramas] if left_out else frames))
+    if unknown := next((frame.lens for frame in capture.frames if isinstance(frame.lens, UnknownLens)), None):
+        unknown(0, 0)
     names = [frame.name for frame in capture.frames]
     if not names:
         raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
@@ -233,13 +247,26 @@ def found_images(capture: Capture) -> Capture:
     return replace(capture, image_folder=folder, frames=tuple(frames), split=split, notes=notes)
 
 
+def _without_unlisted(capture: Capture, options: DataOptions) -> Capture:
+    """Leave out frames without an image, with a note, if they are in neither list of views."""
+    names, there = [frame.name for frame in capture.frames], [frame.image.is_file() for frame in capture.frames]
+    if all(there) or options.split in ("every", "all"):
+        return capture
+    split = split_frames(names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split)
+    kept = [there[i] or i in split.train or i in split.test for i in range(len(names))]
+    if not (lost := [name for name, is_kept in zip(names, kept, strict=True) if not is_kept]):
+        return capture
+    note = f"{len(lost)} poses without an image are in neither list and are not used: {listed(lost)}"
+    return replace(capture, frames=tuple(compress(capture.frames, kept)), notes=(*capture.notes, note))
+
+
 def _refuse_missing(capture: Capture) -> None:
     absent = [frame.name for frame in capture.frames if not frame.image.is_file()]
     if not absent:
         return
     present = {name.casefold(): name for name in image_names(capture.image_folder)}
     hint = next((present[name.casefold()] for name in absent if name.casefold() in present), None)
-    remedy = "set data.images to the folder that holds them, or compute poses of the images that exist (padgs prepare)"
+    remedy = "set data.images to the folder that holds them, or name the others in train.txt and test.txt"
     last_names = {PurePosixPath(name).name for name in absent}
     elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).name in last_names), None)
     above = [image_folder(folder, None) for folder in list(capture.folder.absolute().parents)[:3]]

@@ -78,6 +78,17 @@ def view_name(frame_name: str) -> str:
 
 
 @dataclass(frozen=True)
+class UnknownLens:
+    """Lens of a photograph that its format does not give, or that is not read: only `data.cameras=panoramas` helps."""
+
+    why: str
+
+    def __call__(self, width: int, height: int) -> Camera:
+        """Raise the DataError that says why."""
+        raise DataError(f"{self.why}; leave out images of other cameras with data.cameras=panoramas")
+
+
+@dataclass(frozen=True)
 class Frame:
     """A posed panorama, or a photograph of another camera."""
 

@@ -78,23 +78,34 @@ def best_reading(capture: Capture) -> Capture:
         for i, reading in enumerate(capture.readings)
         if not any(reading.axes.equal(one.axes) and reading.world.equal(one.world) for one in capture.readings[:i])
     ]
-    if not readings or not capture.frames or (len(readings) > 1 and capture.cloud is None):
+    panoramas = [frame for frame in capture.frames if frame.lens is None]
+    if not readings or not panoramas:
         return replace(capture, readings=())
     cloud, best, notes = capture.cloud, readings[0], list(capture.notes)
-    if len(readings) > 1 and cloud is not None:
-        some, fits = capture.frames[:: max(1, len(capture.frames) // VIEWS)][:VIEWS], [0.0]
+    if len(readings) > 1:
+        some, fits = panoramas[:: max(1, len(panoramas) // VIEWS)][:VIEWS], [0.0]
         poses = torch.stack([frame.cam_from_world for frame in some])
-        with suppress(DataError):  # missing and damaged images are reported later
-            images = small_images(decode(frame.image) for frame in some)
-            if (colors := cloud.colors) is not None:
+        with suppress(DataError, ValueError):  # missing and damaged images, and other shapes, are reported later
+            if cloud and (colors := cloud.colors) is not None:
+                images = small_images(decode(frame.image) for frame in some)
                 fits = [colour_fit(one.axes @ poses, images, _moved(cloud.points, one), colors) for one in readings]
         if max(fits) > max(MIN_CORRELATION, fits[0] + MIN_GAIN):
             best = readings[fits.index(max(fits))]
-        why = f"colours agree by {max(fits):.2f}" if max(fits) > MIN_CORRELATION else "not tested by colours"
+        why = f"colours agree by {max(fits):.2f}"
+        if max(fits) <= MIN_CORRELATION:
+            inside = [_share_inside(one.axes @ poses, _moved(cloud.points, one)) if cloud else 0.0 for one in readings]
+            best, why = readings[inside.index(max(inside))], "not tested by colours"
         notes.append(f"{best.words}: {why}")
     frames = (replace(frame, cam_from_world=best.axes @ frame.cam_from_world) for frame in capture.frames)
     cloud = cloud and replace(cloud, points=_moved(cloud.points, best))
     return replace(capture, frames=tuple(frames), cloud=cloud, notes=tuple(notes), readings=())
+
+
+def _share_inside(poses: Tensor, points: Tensor) -> float:
+    """Return the share of cameras in the box around nine tenths of the points, axis by axis."""
+    low, high = (points[:: max(1, len(points) // POINTS)].double().quantile(q, 0) for q in (0.05, 0.95))
+    positions = centers(poses)
+    return ((positions >= low) & (positions <= high)).all(1).double().mean().item()
 
 
 def _moved(points: Tensor, reading: Reading) -> Tensor:

@@ -139,7 +139,8 @@ def _exr(file: Path) -> NDArray:
         pixels = {name: np.asarray(channel.pixels) for name, channel in channels.items() if name != "A"}
     except RuntimeError as error:
         raise DataError(f"{file} is no usable EXR file ({error}); export it again") from error
-    first, *others = pixels.values()
+    depths = [values for name, values in pixels.items() if name.rpartition(".")[2] == "Z"]  # beside a picture
+    first, *others = depths if len(depths) == 1 else pixels.values()
     if not all(np.array_equal(first, other, equal_nan=True) for other in others):
         raise DataError(f"{file} holds the channels {listed(pixels)}, which differ; a depth map has one")
     return first

@@ -73,7 +73,8 @@ def refuse_rotated(image: Image.Image, path: object) -> None:
         if str(orientation) not in ("None", "0", "1"):
             raise DataError(
                 f"{path} carries {source} orientation {orientation}: its pixels are stored rotated, and it is unknown "
-                "which orientation the poses refer to; store it upright (`mogrify -auto-orient`) or remove the flag"
+                "which orientation the poses refer to: if to these pixels, as in COLMAP, remove the flag (`exiftool "
+                "-Orientation= FILE`), else store it upright (`mogrify -auto-orient FILE`)"
             )
 
 

@@ -112,10 +112,11 @@ def find_masks(
         if path not in inspected:
             inspected[path] = inspect(path, mask=True, panorama=frame.lens is None)
         mask_file = inspected[path]
-        is_reduced = frame.lens is None and mask_file.width > image.width  # the image; all panoramas have one shape
+        is_reduced = frame.lens is None and mask_file.width >= width  # of the view; all panoramas have one shape
         if not is_reduced and (mask_file.width, mask_file.height) not in ((image.width, image.height), (width, height)):
             sizes_differ = f"{mask_file.width}x{mask_file.height} but {image.path.name} is {image.width}x{image.height}"
-            raise DataError(f"{path} is {sizes_differ}; a mask must have the size of its image")
+            rule = "a mask must have the size of its image, or be no smaller than the view"
+            raise DataError(f"{path} is {sizes_differ}; {rule} ({width}x{height}, data.width): enlarge it")
         mask = Mask(StoredImage(path, width, height, store, "L"), fixed, inverted ^ path.name.startswith(INVERTED))
         if mask.file not in shown:
             rule = f" of {frame.name}; {_MEANING}"

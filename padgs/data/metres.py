@@ -170,7 +170,7 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     residual = (turn * ours - theirs).abs().square().mean().sqrt().item()
     if not spread >= _MIN_SPREAD:
         needed = f"and at least {_MIN_SPREAD:g} m are needed"
-        raise DataError(f"--gps: the positions spread by {spread:.2g} m, {needed}{instead}")
+        raise DataError(f"--gps: the positions spread by {spread:.3g} m, {needed}{instead}")
     if not residual <= _MAX_RESIDUAL * spread:
         raise DataError(
             f"--gps: cameras are {residual:.2g} m from their GPS positions (root mean square), more than "

@@ -41,7 +41,9 @@ def split_frames(
     """
     if mode == "all":
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
-    files = {side: file for side, name in LISTS.items() if (file := first_of(folder, (name,)))}
+    places = (folder, folder / "sparse" / "0")  # the second as in the released 3DGS
+    found = {side: [file for place in places if (file := first_of(place, (name,)))] for side, name in LISTS.items()}
+    files = {side: some[0] for side, some in found.items() if some}
     lists = dict(stated or {}) if mode == "auto" else {}
     origin = "the split of the data set"
     if lists and files:
@@ -120,7 +122,10 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
     test = tuple(range(0, len(names), every))
     train = tuple(i for i in range(len(names)) if i % every)
     if not train:
-        raise DataError(f"{len(names)} posed view(s) cannot be split; at least 2 are needed, to train and to test on")
+        raise DataError(
+            f"{len(names)} posed view(s) cannot be split; at least 2 are needed, to train and to test "
+            "on: set data.split=all"
+        )
     why = "no train.txt or test.txt" if mode == "auto" else "data.split=every"
     return Split(train, test, (f"split: every {every}th view is a test view ({why})",))
 

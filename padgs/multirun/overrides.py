@@ -183,6 +183,8 @@ def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLo
         key = override.get_key_element()
         values = override.sweep_string_iterator() if override.is_sweep_override() else [None]
         first = list(itertools.islice(values, MOST_JOBS + 1))  # range(1,1e9) would take all memory
+        if not first:
+            raise ValueError(f"{override.input_line} has no value; correct the name or the range")
         texts = [override.get_value_element_as_str() if value is None else value for value in first]
         choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in texts]
     if math.prod(map(len, choices.values())) > MOST_JOBS:

@@ -57,7 +57,8 @@ def ending_by_signals(advice: str = "") -> Iterator[None]:
         try:
             yield
         finally:
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed by who started this
+                sys.stdout.flush()
     except BrokenPipeError:
         _exit(1)
     except BaseException as error:
@@ -76,7 +77,7 @@ def ending_by_signals(advice: str = "") -> Iterator[None]:
 
 def _exit(status: int) -> None:
     """Exit, without errors about output that nobody reads."""
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):
         try:
             stream.flush()
         except OSError:

@@ -36,6 +36,7 @@ class Method(ABC):
     CUT_FINENESS: ClassVar[float] = 1.0  # pixels of a perspective view are taken to be so much finer than a panorama's
     RENDER: ClassVar[RenderConfig] = RenderConfig()
     TRAIN: ClassVar[TrainOptions] = TrainOptions()
+    HAS_GAUSSIANS: ClassVar[bool] = False  # the model keeps to `budget.gaussians`, and importance can prune it
     RUN_RATES: ClassVar[str] = "run"  # law that `train.learning_rates=run` stands for
 
     def __init__(
@@ -196,8 +197,14 @@ class Method(ABC):
         """Similarity model_from_given of the world, if held-out views follow learned poses."""
         return None if self._poses is None else self._poses.world()
 
+    @property
+    def _name(self) -> str:
+        return type(self).__name__.removesuffix("Method")
+
     def refuse_budget(self, budget: Budget) -> None:
         """Refuse a budget that this method cannot train within on any scene; subclasses add checks."""
+        if budget.gaussians is not None and not self.HAS_GAUSSIANS:
+            raise ValueError(f"budget.gaussians is {budget.gaussians}, but {self._name} has no Gaussians; leave it out")
         if budget.stop == "auto" and self._views_learn:
             raise ValueError(
                 "budget.stop is auto, which measures validation views, but exposures or cameras are learned here, and "
@@ -206,6 +213,9 @@ class Method(ABC):
 
     def refuse_search(self) -> None:
         """Refuse the search for the smallest model (`padgs.runs.smallest`) on any scene; subclasses add checks."""
+        if not self.HAS_GAUSSIANS:
+            why = "no Gaussians to prune, so it has no smallest model"
+            raise ValueError(f"{self._name} has {why}; take a method with Gaussians")
         if self._views_learn:
             raise ValueError(
                 "the search for the smallest model compares renders with photographs, but exposures or cameras are "

@@ -100,6 +100,11 @@ def test_renders_in_a_folder_score_like_their_run(run, tmp_path):
     assert code == 0 and "1 files belong to no test view, such as cover.png" in output, output
     own = results.read(run / results.FILE_NAME).scores["sphere"].metrics
     assert the_result(tmp_path / "out").scores["sphere"].metrics["ws_psnr"] == pytest.approx(own["ws_psnr"], abs=1e-4)
+    whole = (folder / f"{view.name}.png").read_bytes()
+    (folder / f"{view.name}.png").write_bytes(whole[: len(whole) // 2])
+    code, output = padgs_command("score", folder, "--data", run, "--to", tmp_path / "damaged")
+    assert code == 1 and f"{view.name}.png is damaged (" in output and "render it again" in output
+    assert not (tmp_path / "damaged").exists()
     shutil.copy(folder / "cover.png", folder / f"{view.name}.png")
     assert f"{view.name}.png is 2x1; the test view is 64x32" in padgs_command("score", folder, "--data", run)[1]
     Image.new("RGBA", (64, 32)).save(folder / f"{view.name}.png")

@@ -53,6 +53,14 @@ def test_tests_of_the_example_method_pass(installed, tmp_path):
     assert len(promises) == 4
 
 
+def test_a_method_that_counts_no_gaussians_refuses_to_limit_and_to_prune_them(installed):
+    method = padgs.make_method("my_method")
+    with pytest.raises(ValueError, match="budget.gaussians is 100, but My has no Gaussians; leave it out"):
+        method.refuse_budget(padgs.Budget(10, gaussians=100))
+    with pytest.raises(ValueError, match="My has no Gaussians to prune, so it has no smallest model"):
+        method.refuse_search()
+
+
 def test_a_format_of_another_package_is_read_by_its_name(installed, root, tmp_path):
     folder, world = tmp_path / "capture", make_world()
     write_images(world, folder / "images")

@@ -127,6 +127,12 @@ def test_output_that_nobody_reads_ends_the_command_in_silence(root):
     assert (done.returncode, done.stderr) == (1, b"")
 
 
+def test_a_command_without_any_output_succeeds(root):
+    code = "import sys; sys.argv[1:] = ['convert', '--help']; from padgs.cli.app import main; main()"
+    done = subprocess.run(["sh", "-c", 'exec "$0" -c "$1" >&-', sys.executable, code], stderr=subprocess.PIPE, cwd=root)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_help_breaks_lines_where_the_terminal_ends(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert "explicit ones; the loss is measured, printed and written into the file." in run("export", "--help").output

@@ -91,6 +91,19 @@ def test_random_points_and_missing_files(folder: Path) -> None:
         load(folder, points="absent.ply")
 
 
+def test_poses_without_an_image_do_not_matter_if_no_list_has_them(folder: Path) -> None:
+    (folder / "images" / "pano_02.png").unlink()
+    with pytest.raises(DataError, match="no image in .*: pano_02.png; .* or name the others in train.txt and test.txt"):
+        load(folder)
+    (folder / "train.txt").write_text("pano_00\npano_01\npano_03\n")
+    (folder / "test.txt").write_text("pano_04\n")
+    scene = load(folder)
+    assert [view.name for view in scene.train] == ["pano_00", "pano_01", "pano_03"]
+    assert "1 poses without an image are in neither list and are not used: pano_02.png" in scene.notes
+    with pytest.raises(DataError, match="1 of 6 poses have no image"):
+        load(folder, split="all")
+
+
 def test_the_working_directory_has_a_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     assert load(".").name == load(folder).name == "scene"

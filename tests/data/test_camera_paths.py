@@ -166,7 +166,11 @@ def test_nerfstudio_paths_are_converted_to_the_scene(applied, tmp_path):
     normalized = {"transform": transform.tolist(), "scale": scale * applied.get("applied_scale", 1)}
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(normalized))
     (tmp_path / "transforms.json").write_text(json.dumps(applied))
-    found = read_path(tmp_path / "path.json", None, UP, tmp_path / "transforms.json")
+    with pytest.warns(UserWarning, match="the fields of view of the camera path are not used; set --camera and --fov"):
+        found = read_path(tmp_path / "path.json", None, UP, tmp_path / "transforms.json")
+    for camera in cameras:
+        del camera["fov"]
+    (tmp_path / "path.json").write_text(json.dumps({"camera_path": cameras, "fps": 24, "seconds": 0.1}))
     assert np.allclose(found.numpy(), np.linalg.inv(ours)), "0.1 s have three frames at 30 a second"
     assert len(read_path(tmp_path / "path.json", None, UP, tmp_path / "transforms.json", fps=120)) == 12
     (tmp_path / "dataparser_transforms.json").unlink()

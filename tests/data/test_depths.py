@@ -1,9 +1,11 @@
 """Depth maps: stand-ins for OB3D and TartanAir-V2 in their exact layout, folders of one's own, and their scores."""
 
 import json
+import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from padgs.checks import lookup
 from padgs.data import DATASETS, DataError, load
 from padgs.data.capture import Capture, DepthMeaning, Frame
 from padgs.data.check import check
-from padgs.data.depths import Depth, _depth_files
+from padgs.data.depths import Depth, _depth_files, _exr
 from padgs.data.formats.convert import convert
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import score
@@ -241,6 +243,20 @@ def test_an_image_of_depth_is_no_depth_map(world: World, tmp_path: Path):
     (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray"}')
     with pytest.raises(DataError, match="does not say what the depth maps hold .*'unit'"):
         load(tmp_path)
+
+
+def test_the_depth_of_an_exr_file_is_its_only_channel_or_z(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def holding(**levels: float) -> SimpleNamespace:
+        channels = {name.replace("_", "."): SimpleNamespace(pixels=np.full((4, 8), x)) for name, x in levels.items()}
+        file = SimpleNamespace(channels=lambda: channels)
+        return SimpleNamespace(File=lambda *_, **__: file)
+
+    for levels, depth in (({"V": 2.0}, 2), ({"R": 3, "G": 3, "B": 3, "A": 1}, 3), ({"R": 1, "G": 2, "View_Z": 4}, 4)):
+        monkeypatch.setitem(sys.modules, "OpenEXR", holding(**levels))
+        assert (_exr(tmp_path / "a.exr") == depth).all()
+    monkeypatch.setitem(sys.modules, "OpenEXR", holding(R=1, G=2))
+    with pytest.raises(DataError, match="a.exr holds the channels R, G, which differ"):
+        _exr(tmp_path / "a.exr")
 
 
 def test_z_of_a_perspective_view_becomes_the_distance_along_the_ray(tmp_path: Path):

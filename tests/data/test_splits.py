@@ -106,6 +106,14 @@ def test_lists_are_found_in_any_case_and_said_to_be_unused_beside_a_stated_split
     assert split_frames(NAMES, tmp_path, stated={"test": ("c.jpg",)}, mode="files").test == (1,)
 
 
+def test_lists_beside_the_model_as_in_the_released_3dgs(tmp_path: Path) -> None:
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "0" / "test.txt").write_text("b\n")
+    assert split_frames(NAMES, tmp_path).test == (1,)
+    (tmp_path / "test.txt").write_text("c\n")
+    assert split_frames(NAMES, tmp_path).test == (2,)
+
+
 def test_names_with_separators_of_unicode_are_one_line(tmp_path: Path) -> None:
     for name in ("a\u2028b.jpg", "a\x85b.jpg", "a\x0bb.jpg"):
         (tmp_path / "test.txt").write_text(f"{name}\r\n", encoding="utf-8")

@@ -277,7 +277,7 @@ def test_runs_that_cannot_be_searched_are_refused_with_a_way_out(load, tmp_path)
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        (("method=egonerf_small",), "egonerf has no Gaussians to prune"),
+        (("method=egonerf_small",), "EgoNeRF has no Gaussians to prune"),
         (("method=sc_omnigs",), "cameras"),
         (("method=cubemap_3dgs",), "views are cut from all panoramas"),
         (("train.exposures=learned",), "exposures or cameras are learned here"),

@@ -97,6 +97,8 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
         check_suffix(path)
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "splats.ply"
+            if path.name.lower().endswith(".ply"):
+                read_vertices(path)  # the converter fills up what a truncated file lacks
             try:
                 _convert(path, plain)
             except ValueError as error:
@@ -106,7 +108,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     rest = sum(name.startswith("f_rest_") for name in names)
     if "packed_position" in names:
         raise DataError(f"{path} is a compressed PLY; name it {path.stem}.compressed.ply")
-    if missing := [name for name in _NEEDED if name not in names]:
+    if missing := [name for name in (*_NEEDED, *(f"f_rest_{n}" for n in range(rest))) if name not in names]:
         raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:

@@ -8,13 +8,14 @@ world = chunk x component x camera. A file without any of them is in the chunk's
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as XML
 
 import torch
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, files_with, listed
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, UnknownLens, files_with, listed
 from padgs.data.cloud import read_ply
 from padgs.data.formats.poses import cam_from_pose, checked_rotation, rigid
 from padgs.data.images import read_bytes
@@ -51,12 +52,12 @@ def read(path: Path, options: DataOptions) -> Capture:
     chunks = root.findall("chunk") if root.tag == "document" else []
     if not chunks:
         raise DataError(f"{file} holds no <chunk> in a <document>; it must be an export of Metashape's cameras as XML")
-    chunk = max(chunks, key=lambda chunk: sum(camera.find("transform") is not None for camera in chunk.iter("camera")))
+    chunk = max(chunks, key=lambda chunk: (_is_on(chunk), sum(map(_is_usable, chunk.iter("camera")))))
     notes = [f"{file.name} holds {len(chunks)} chunks; {chunk.get('label')!r} is used"] if len(chunks) > 1 else []
     folder = image_folder(file.parent, options.images)
     every = list(_cameras(chunk))
-    on = [(name, camera) for name, camera in every if camera.get("enabled", "true").lower() not in ("false", "0")]
-    aligned = [(name, camera) for name, camera in on if camera.find("transform") is not None]
+    on = [(name, camera) for name, camera in every if _is_on(camera)]
+    aligned = [(name, camera) for name, camera in on if _is_usable(camera)]
     if len(on) < len(every):
         notes.append(f"{len(every) - len(on)} cameras are disabled in Metashape and not used")
     if len(aligned) < len(on):
@@ -65,7 +66,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     if not aligned:
         raise DataError(f"{file} holds no enabled camera with a <transform>; align the photos, and export again")
     _refuse_twins([name for name, _ in aligned], file)
-    sizes = _sizes(chunk, {camera.get("sensor_id", "") for _, camera in aligned}, file)
+    sensors = _sensors(chunk, {camera.get("sensor_id", "") for _, camera in aligned}, file)
     components = _components(chunk, {camera.get("component_id", "") for _, camera in aligned}, file)
     outer, where = chunk.find("transform"), f"<transform> of the chunk in {file}"
     same = torch.eye(4, dtype=torch.float64)
@@ -77,20 +78,28 @@ def read(path: Path, options: DataOptions) -> Capture:
         cam = cam_from_pose(_numbers(camera.find("transform"), 16, where).reshape(4, 4), where)
         pose = world @ inner @ torch.linalg.inv(cam)
         pose[:3, :3] /= torch.linalg.det(pose[:3, :3]) ** (1 / 3)
-        frames.append(Frame(name, folder / name, cam_from_pose(pose, where), *sizes[camera.get("sensor_id", "")]))
+        frames.append(Frame(name, folder / name, cam_from_pose(pose, where), **sensors[camera.get("sensor_id", "")]))
     if outer is None and all(matrix.equal(same) for matrix in components.values()):
         notes.append(f"{file.name} has no <transform> of a chunk or component: lengths are in the chunk's own unit")
     plys = [file.parent / name for name in _PLY if (file.parent / name).is_file()] or files_with(file.parent, ".ply")
     plys = plys if options.points == "auto" else []  # else a missing or damaged file does not matter
     if len(plys) > 1:
         notes.append(f"points: {plys[0].name}, not {listed(ply.name for ply in plys[1:])}; set data.points to choose")
-    # In which frame a cloud was exported is not stated in its file.
-    readings = [("points in the frame of the chunk", world), ("points in the frame of the world", same)]
+    # In which frame a cloud was exported is not stated in its file; Metashape's own choice is the world.
+    readings = [("points in the frame of the world", same), ("points in the frame of the chunk", world)]
     if len(components) == 1:
         readings.append(("points in the frame of the component", world @ next(iter(components.values()))))
     cloud = read_ply(plys[0]) if plys else None
     possible = tuple(Reading(words, same, matrix) for words, matrix in readings)
     return Capture("metashape", file.parent, folder, tuple(frames), cloud, notes=tuple(notes), readings=possible)
+
+
+def _is_on(element: XML.Element) -> bool:
+    return element.get("enabled", "true").lower() not in ("false", "0")
+
+
+def _is_usable(camera: XML.Element) -> bool:
+    return _is_on(camera) and camera.find("transform") is not None
 
 
 def _cameras(chunk: XML.Element) -> Iterator[tuple[str, XML.Element]]:
@@ -114,25 +123,24 @@ def _refuse_twins(names: list[str], file: Path) -> None:
         )
 
 
-def _sizes(chunk: XML.Element, used: set[str], file: Path) -> dict[str, tuple[int, int]]:
-    """Return width and height of the used sensors by id, which must be spherical."""
-    sizes, sensors = {}, {sensor.get("id", ""): sensor for sensor in chunk.findall("sensors/sensor")}
+def _sensors(chunk: XML.Element, used: set[str], file: Path) -> dict[str, dict[str, Any]]:
+    """Return what the used sensors say of a `Frame`, by id: width and height; if not spherical, the lens."""
+    found, sensors = {}, {sensor.get("id", ""): sensor for sensor in chunk.findall("sensors/sensor")}
     for key in sorted(used):
         if key not in sensors:
             raise DataError(f"{file}: cameras use <sensor id={key!r}>, which is not in <sensors>; export them again")
         where, kind = f"<sensor id={key!r} label={sensors[key].get('label')!r}>", sensors[key].get("type")
         if (kind or "").lower() != "spherical":
-            raise DataError(
-                f"{file}: {where} has the type {kind!r}; only 'spherical' sensors (panoramas) can be used: disable the "
-                "cameras of the other sensors in Metashape, or set Tools > Camera Calibration > Type to Spherical"
-            )
+            rule = "only 'spherical' sensors (panoramas) can be used, set in Tools > Camera Calibration > Type"
+            found[key] = {"lens": UnknownLens(f"{file}: {where} has the type {kind!r}; {rule}")}
+            continue
         size = sensors[key].find("resolution")
         try:
             assert size is not None
-            sizes[key] = int(size.get("width", "")), int(size.get("height", ""))
+            found[key] = {"width": int(size.get("width", "")), "height": int(size.get("height", ""))}
         except (AssertionError, ValueError) as error:
             raise DataError(f"{file}: {where} lacks <resolution width= height=>; export the cameras again") from error
-    return sizes
+    return found
 
 
 def _components(chunk: XML.Element, used: set[str], file: Path) -> dict[str, Tensor]:

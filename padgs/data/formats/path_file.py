@@ -80,6 +80,8 @@ def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -
         where = f"there is no {transforms.name} beside the camera path"
         warnings.warn(f"{where}: it is taken to be in the world of the data set; copy it from the run", stacklevel=2)
     poses = []
+    if any(entry.get("fov") for entry in cameras.entries()):
+        warnings.warn("the fields of view of the camera path are not used; set --camera and --fov", stacklevel=2)
     for entry in cameras.entries():
         stated = entry["camera_to_world"]
         world_from_cam = stated.numbers()

@@ -68,7 +68,7 @@ def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     quaternion = _finite(quaternion, where)
     length = quaternion.norm().item()
     if abs(length - 1) > 0.01:
-        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1")
+        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1: divide it by that")
     w, x, y, z = (quaternion if abs(length - 1) < 1e-12 else quaternion / length).tolist()
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -102,7 +102,7 @@ def checked_rotation(rotation: Tensor, where: str) -> Tensor:
             raise DataError(f"{where}: the pose holds a rotation times {scale:.6g}; {remedy}")
         raise DataError(
             f"{where}: the 3x3 part of the pose is not a rotation: R R^T differs from the identity by "
-            f"{off.item():.3g} (at most {TOLERANCE:g} is accepted as rounding)"
+            f"{off.item():.3g} (at most {TOLERANCE:g} is accepted as rounding); export it with four digits or more"
         )
     if (determinant := torch.linalg.det(rotation).item()) < 0:
         remedy = "one axis is mirrored, negate the column of the axis that points the wrong way"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, UnknownLens
 from padgs.data.cloud import color_bytes, first_ply, whole_if_possible
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center, cam_from_world, rotation_from_vector
@@ -37,22 +37,26 @@ def read_openmvg(path: Path, options: DataOptions) -> Capture:
     folder, data = file.parent, read_json(file)
     views, poses = _mvg_views(data), _mvg_poses(data)
     posed = [view for view in views if view.pose in poses]
-    used = {view.intrinsic for view in posed}
     names: dict[int, str] = {}  # of classes
+    lenses: dict[int | None, UnknownLens | None] = {}  # by intrinsic; of views without one: that of any other camera
     for item in data["intrinsics"].entries():  # cereal names a class only where it first occurs
         value = item["value"]
         number = value["polymorphic_id"].whole() & CEREAL_ID if value.get("polymorphic_id") else 0
         if name := value.get("polymorphic_name"):
             names[number] = name.text()
         kind = names.get(number, "spherical")
-        if kind != "spherical" and not used.isdisjoint({item["key"].whole(), None}):
-            raise DataError(f"{file} holds a {kind!r} camera; only spherical cameras (panoramas) can be used")
+        if kind != "spherical":
+            unknown = UnknownLens(f"{file} holds a {kind!r} camera; only spherical cameras (panoramas) can be used")
+            lenses[None] = lenses[item["key"].whole()] = unknown
     # The image folder on the machine of the reconstruction; only its last name is used, because a file from elsewhere
     # must not reach other folders.
     stated = data.get("root_path")
     root = PurePosixPath(stated.text().replace("\\", "/")).name if stated else ""
     images = image_folder(folder, options.images, ("images", "imgs", *({root} - {"", ".."})))
-    frames = tuple(Frame(view.name, images / view.name, poses[view.pose], *view.size) for view in posed)
+    frames = tuple(
+        Frame(view.name, images / view.name, poses[view.pose], *view.size, lens=lenses.get(view.intrinsic))
+        for view in posed
+    )
     if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply")):
         note = "points: from the PLY file beside sfm_data.json, which has colours"
         return Capture("openmvg", folder, images, frames, colored, notes=(note,))
@@ -122,12 +126,12 @@ def read_opensfm(path: Path, options: DataOptions) -> Capture:
         shot = Json(value.value, f"shot {check_name(name, str(file))} of {file}")
         camera = best["cameras"][shot["camera"].text()]
         model = camera["projection_type"].text()
-        if model not in ("spherical", "equirectangular"):
-            raise DataError(f"{shot.where} has a {model!r} camera; only spherical cameras (panoramas) can be used")
+        unknown = UnknownLens(f"{shot.where} has a {model!r} camera; only spherical cameras (panoramas) can be used")
+        lens = None if model in ("spherical", "equirectangular") else unknown
         rotation = rotation_from_vector(shot["rotation"].numbers(3), shot.where)
         pose = cam_from_world(rotation, shot["translation"].numbers(3), shot.where)
         width, height = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
-        frames.append(Frame(name, images / name, pose, width, height))
+        frames.append(Frame(name, images / name, pose, width, height, lens=lens))
     used = f"{file.name} holds {len(parts)} reconstructions; the one with the most shots, {len(frames)}, is used"
     notes = (used,) if len(parts) > 1 else ()
     return Capture("opensfm", file.parent, images, tuple(frames), _opensfm_cloud(best), notes=notes)

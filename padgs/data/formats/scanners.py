@@ -67,14 +67,17 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
     root, named = path.parent if path.is_file() else path, listed(file.name for file in files)
     frames: list[Frame] = []
     others: list[str] = []
+    edited: list[str] = []
     clouds: list[Cloud] = []
     notes: list[str] = []
     folder = root / f"{files[0].stem}_images" if len(files) == 1 else root
     for file in files:
         inside = "" if len(files) == 1 else f"{file.stem}_images/"
+        since = file.stat().st_mtime
         with open_e57(file) as opened:
             for index, (name, image) in enumerate(_named_images(opened)):
-                frame = _frame(image, f"images2D[{index}] {name!r} of {file}", folder, f"{inside}{name}")
+                where = f"images2D[{index}] {name!r} of {file}"
+                frame = _frame(image, where, folder, f"{inside}{name}", since, edited)
                 frames += [frame] if frame else []
                 others += [] if frame else [name]
         if options.points == "auto":
@@ -89,6 +92,8 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
             "too, or use the file as points of another data set (data.points)"
         )
     notes.append(f"images: {len(frames)} panoramas of {named}, written beside it")
+    if edited:
+        notes.append(f"images: {listed(edited)} differ from those of {named}, and are used because they are newer")
     cloud = joined(clouds)
     cloud = cloud if len(cloud.points) else None
     return Capture("e57", root, folder, tuple(frames), cloud, notes=tuple(notes), readings=_turned())
@@ -107,8 +112,11 @@ def _named_images(opened: Any) -> Iterator[tuple[str, Any]]:
         yield name, image
 
 
-def _frame(image: Any, where: str, folder: Path, name: str) -> Frame | None:
-    """Write the picture of a panorama, unless it is there, and return its frame; None for other images."""
+def _frame(image: Any, where: str, folder: Path, name: str, since: float, edited: list[str]) -> Frame | None:
+    """Write the picture of a panorama, unless it is there, and return its frame; None for other images.
+
+    Pictures that differ and are newer than the E57 file, which is of `since`, stay; their names go to `edited`.
+    """
     if not image.isDefined("sphericalRepresentation"):
         return None
     sphere = image["sphericalRepresentation"]
@@ -122,21 +130,25 @@ def _frame(image: Any, where: str, folder: Path, name: str) -> Frame | None:
     center = [pose["translation"][axis].value() for axis in "xyz"]
     suffix = ".jpg" if kind == "jpegImage" else ".png"
     name = name if name.lower().endswith((suffix, ".jpeg")) else f"{name}{suffix}"
-    _write_blob(sphere[kind], folder / name)
+    edited += _write_blob(sphere[kind], folder / name, since)
     if sphere.isDefined("imageMask"):
-        _write_blob(sphere["imageMask"], (folder / name).with_name(f"{Path(name).stem}_mask.png"))
+        edited += _write_blob(sphere["imageMask"], (folder / name).with_name(f"{Path(name).stem}_mask.png"), since)
     found = cam_from_panorama(torch.tensor(turn, dtype=torch.float64), torch.tensor(center, dtype=torch.float64), where)
     return Frame(name, folder / name, found)
 
 
-def _write_blob(blob: Any, path: Path) -> None:
+def _write_blob(blob: Any, path: Path, since: float) -> list[str]:
+    """Write a picture; return its name instead if a newer one is there."""
     data = np.zeros(blob.byteCount(), np.uint8)
     blob.read(data, 0, len(data))
     try:
         if path.is_file() and path.read_bytes() == data.tobytes():  # the folder may be read-only
-            return
+            return []
+        if path.is_file() and path.stat().st_mtime > since:
+            return [path.name]
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, data.tobytes())
+        return []
     except OSError as error:
         raise DataError(
             f"cannot write {path} ({error.strerror or error}); move the E57 file where you may write"

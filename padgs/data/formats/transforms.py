@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, first_of
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, UnknownLens, first_of
 from padgs.data.cloud import first_ply, read_ply
 from padgs.data.depths import HOW
 from padgs.data.formats import detect
@@ -38,7 +38,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side, meta in metas.items():
-        part = [_frame(meta, frame, folder, root) for frame in meta["frames"].entries()]
+        entries, reads_masks = meta["frames"].entries(), options.mask == "auto"
+        part = [_frame(meta, frame, folder, root, reads_masks=reads_masks) for frame in entries]
         frames += part
         if len(metas) > 1:
             split[side] = tuple(frame.name for frame in part)
@@ -55,9 +56,11 @@ def read(path: Path, options: DataOptions) -> Capture:
     if options.points == "auto":  # else a missing or damaged file does not matter
         cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
     meant = mask.text() if mask else "auto"  # as `padgs split` states it
-    notes = ()
+    notes: tuple[str, ...] = ()
+    if len(metas) > 1 and len(unused := [file for name in SIDES["test"] if (file := first_of(folder, (name,)))]) > 1:
+        notes = (f"{unused[1].name} is not used: {unused[0].name} has the test views",)
     if any(frame.get("depth_file_path") for meta in metas.values() for frame in meta["frames"].entries()):
-        notes = (f"depth: depth_file_path is not read; {HOW}",)
+        notes += (f"depth: depth_file_path is not read; {HOW}",)
     return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant, notes=notes)
 
 
@@ -69,22 +72,22 @@ def transforms_file(path: str | None, format: str) -> Path | None:
     return file if file.is_file() else None
 
 
-def _frame(meta: Json, frame: Json, folder: Path, root: Path) -> Frame:
+def _frame(meta: Json, frame: Json, folder: Path, root: Path, *, reads_masks: bool) -> Frame:
     name = _name(frame["file_path"])
     stated = frame.get("camera_model") or meta.get("camera_model")
     model = stated and stated.text()
-    if model is None or model.upper() not in MODELS:
-        rule = "only EQUIRECTANGULAR panoramas can be used (set camera_model if these are panoramas)"
-        raise DataError(f"{meta.where}: {name} has camera_model {model!r}; {rule}")
+    rule = "only EQUIRECTANGULAR panoramas can be used (set camera_model if these are panoramas)"
+    unknown = UnknownLens(f"{meta.where}: {name} has camera_model {model!r}; {rule}")
+    lens = None if model and model.upper() in MODELS else unknown
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]
-    mask = frame.get("mask_path")
+    mask = frame.get("mask_path") if reads_masks else None
     width, height = (side and side.whole() for side in (frame.get(key) or meta.get(key) for key in ("w", "h")))
     pose = cam_from_opengl_pose(matrix.numbers(), matrix.where)
     stated = frame.get("share") or Json(1.0, "share")
     share = stated.numbers()
     if share.ndim or not 0 < share <= 1:
         raise DataError(f"{stated.where} is {stated.value}; it must be a number above 0 and at most 1, for each pass")
-    return Frame(name, root / name, pose, width, height, mask and mask.path_in(folder), share=share.item())
+    return Frame(name, root / name, pose, width, height, mask and mask.path_in(folder), share=share.item(), lens=lens)
 
 
 def _name(path: Json) -> str:

@@ -181,6 +181,7 @@ class PaDGSMethod(Method):
     """PaD-GS: anchors whose Gaussians are decoded for each view."""
 
     Options = PaDGSMethodOptions
+    HAS_GAUSSIANS = True
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()

@@ -78,6 +78,7 @@ class SplatMethod(Method):
     """See `padgs.training.method.Method`; subclasses set options, model class and renderer defaults."""
 
     Options = SplatOptions
+    HAS_GAUSSIANS = True
     MODEL: ClassVar[Callable[..., SplatModel]] = SplatModel
     TRAIN = TrainOptions(weight="uniform")
     _filled: tuple[Scene, int, Scene, torch.Tensor] | None = None  # last arguments and result of `_filled_scene`

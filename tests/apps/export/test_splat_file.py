@@ -82,6 +82,22 @@ def test_invalid_files_are_refused(tmp_path, generator):
         read_splats(tmp_path / "a.ply")
 
 
+def test_harmonics_are_numbered_from_0(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", random_splats(1, generator))
+    text = (tmp_path / "a.ply").read_bytes().replace(b"float f_rest_0\n", b"float f_rest_9\n")
+    (tmp_path / "a.ply").write_bytes(text)
+    with pytest.raises(DataError, match="a.ply has no property f_rest_0; Gaussians of 3DGS"):
+        read_splats(tmp_path / "a.ply")
+
+
+def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path, generator, monkeypatch):
+    monkeypatch.setattr(splat_file, "check_suffix", lambda path: None)  # where the converter is missing
+    write_splats(tmp_path / "a.ply", random_splats(1, generator))
+    (tmp_path / "a.compressed.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-9])
+    with pytest.raises(DataError, match="a.compressed.ply is not a readable PLY file .*end-of-file"):
+        read_splats(tmp_path / "a.compressed.ply")
+
+
 def test_a_missing_converter_is_reported(tmp_path, generator, monkeypatch):
     monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
     with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or write a .ply"):

@@ -119,6 +119,10 @@ def test_transforms_files_for_validation_and_alone(world: World, tmp_path: Path)
         (scene / f"transforms_{side}.json").write_text(json.dumps({**whole, "frames": frames}))
     names = [Path(frame["file_path"]).stem for frame in whole["frames"]]
     assert [view.name for view in load(scene).test] == names[4:]
+    (scene / "transforms_test.json").write_text(json.dumps({**whole, "frames": whole["frames"][3:4]}))
+    (scene / "transforms_train.json").write_text(json.dumps({**whole, "frames": whole["frames"][:3]}))
+    assert "transforms_val.json is not used: transforms_test.json has the test views" in load(scene).notes
+    (scene / "transforms_test.json").unlink()
     (scene / "transforms_train.json").write_text(json.dumps({**whole, "frames": whole["frames"]}))
     (scene / "transforms_val.json").unlink()
     for side in ("train", "test"):
@@ -231,6 +235,45 @@ def test_cameras_of_openmvg_that_no_view_uses_do_not_matter(world: World, tmp_pa
         file.write_text(json.dumps(data))
         with pytest.raises(DataError, match="holds a 'pinhole' camera; only spherical"):
             load(tmp_path)
+
+
+def _other_camera(data: Any, format: str) -> None:
+    """Make the first image one of another camera."""
+    if format == "transforms":
+        data["frames"][0]["camera_model"] = "OPENCV"
+    elif format == "opensfm":
+        data[1]["cameras"]["phone"] = {"projection_type": "perspective"}
+        next(iter(data[1]["shots"].values()))["camera"] = "phone"
+    else:
+        value = {"polymorphic_id": 2147483650, "polymorphic_name": "pinhole", "ptr_wrapper": {}}
+        data["intrinsics"].append({"key": 7, "value": value})
+        data["views"][0]["value"]["ptr_wrapper"]["data"]["id_intrinsic"] = 7
+
+
+@pytest.mark.parametrize(
+    ("format", "file"),
+    [("transforms", "transforms.json"), ("opensfm", "reconstruction.json"), ("openmvg", "sfm_data.json")],
+)
+def test_photographs_beside_panoramas_are_left_out_on_request(format: str, file: str, world: World, tmp_path: Path):
+    WRITERS[format](world, tmp_path)
+    data = json.loads((tmp_path / file).read_text())
+    _other_camera(data, format)
+    (tmp_path / file).write_text(json.dumps(data))
+    with pytest.raises(DataError, match="; leave out images of other cameras with data.cameras=panoramas"):
+        load(tmp_path)
+    scene = load(tmp_path, cameras="panoramas", split="all")
+    assert len(scene.train) == len(world.names) - 1 and world.names[0] not in [view.name for view in scene.train]
+    assert any("1 of 6 images are no panoramas; they are left out" in note for note in scene.notes)
+
+
+def test_absolute_masks_do_not_matter_if_masks_are_not_used(world: World, tmp_path: Path) -> None:
+    def masked(meta: dict[str, Any]) -> None:
+        meta |= {"frames": [{**frame, "mask_path": "/data/masks/x.png"} for frame in meta["frames"]]}
+
+    _written(world, tmp_path, masked)
+    with pytest.raises(DataError, match="names must be relative and stay inside the folder: put it there"):
+        load(tmp_path / "scene")
+    assert load(tmp_path / "scene", mask="none").train[0].mask() is None
 
 
 def test_empty_optional_names_are_as_good_as_none(world: World, tmp_path: Path) -> None:

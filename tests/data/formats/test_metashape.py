@@ -10,6 +10,8 @@ import torch
 from support.fixtures import World, make_world, write_metashape
 
 from padgs.data import DataError, load, read
+from padgs.data.capture import Cloud
+from padgs.data.cloud import read_ply, write_ply
 
 
 @pytest.fixture
@@ -53,6 +55,34 @@ def test_the_frame_of_named_points_is_decided_too(world: World, tmp_path: Path) 
     scene = load(tmp_path, points="scans/a.ply")
     assert any("points in the frame of the world: colours agree by 0.9" in note for note in scene.notes)
     torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
+
+
+@pytest.mark.parametrize("cloud", ["chunk", "world"])
+def test_points_without_colours_are_those_of_the_world_unless_they_miss_the_cameras(
+    cloud: str, world: World, tmp_path: Path
+) -> None:
+    write_metashape(world, tmp_path, cloud=cloud)
+    write_ply(tmp_path / "dense.ply", Cloud(read_ply(tmp_path / "dense.ply").points, None))
+    scene = load(tmp_path)
+    assert any(f"points in the frame of the {cloud}: not tested by colours" in note for note in scene.notes)
+    torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
+
+
+def test_a_disabled_chunk_is_not_used(folder: Path) -> None:
+    text = (folder / "cameras.xml").read_text()
+    chunk = re.search(r"<chunk .*</chunk>", text, re.DOTALL)[0]  # type: ignore[index]
+    other = re.sub("<chunk [^>]*>", '<chunk label="old" enabled="false">', chunk)
+    (folder / "cameras.xml").write_text(text.replace(chunk, other + chunk))
+    assert any("holds 2 chunks; 'Chunk 1' is used" in note for note in read(folder).notes)
+
+
+def test_photographs_of_other_sensors_are_left_out_on_request(folder: Path) -> None:
+    _edit(folder, ('<camera id="0" sensor_id="0"', '<camera id="0" sensor_id="2"'))
+    with pytest.raises(DataError, match=r"type 'frame'; only 'spherical' .*; leave out .* with data.cameras=panoramas"):
+        load(folder)
+    scene = load(folder, cameras="panoramas", split="every")
+    assert len(scene.train) + len(scene.test) == 5
+    assert any("1 of 6 images are no panoramas; they are left out" in note for note in scene.notes)
 
 
 def test_cameras_without_use_are_noted(folder: Path) -> None:

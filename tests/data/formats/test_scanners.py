@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import os
 import struct
 import sys
 from pathlib import Path
@@ -10,11 +11,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from support.fixtures import PANORAMA, World, quaternion, write_images, write_navvis
 
 from padgs.data import DataError, load, read
 from padgs.data import scans as scans_module
-from padgs.data.cloud import read_cloud
+from padgs.data.capture import Cloud
+from padgs.data.cloud import read_cloud, write_ply
 
 
 @pytest.mark.parametrize(("turn", "along"), [(0, "x"), (90, "y"), (180, "-x"), (-90, "-y")])
@@ -25,6 +28,24 @@ def test_turned_images_of_navvis_are_recognised_by_colours(turn: float, along: s
     for view in scene.train:
         rotation = torch.from_numpy(world.rotations[world.names.index(view.name)])
         torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("points", ["random", "grey.ply"])
+def test_other_points_do_not_turn_the_cameras(points: str, world: World, tmp_path: Path) -> None:
+    write_navvis(world, tmp_path / "scan", 180)
+    (tmp_path / "scan" / "x").mkdir()
+    write_ply(tmp_path / "scan" / "x" / "grey.ply", Cloud(torch.from_numpy(world.points), None))
+    scene = load(tmp_path / "scan", points=points.replace("grey", "x/grey"))
+    assert any("centres of images along -x of their poses: colours agree by 0.9" in note for note in scene.notes)
+    assert sum("format: navvis" in note for note in scene.notes) == 1
+    assert len(scene.points) == (400 if points == "grey.ply" else 100_000)
+    view = scene.train[0]
+    rotation = torch.from_numpy(world.rotations[world.names.index(view.name)])
+    torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+    for file in (tmp_path / "scan").glob("*.ply"):
+        file.unlink()
+    notes = load(tmp_path / "scan", points=points.replace("grey", "x/grey")).notes
+    assert any("centres of images along x of their poses: not tested by colours" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -177,8 +198,21 @@ def test_pictures_of_another_export_of_an_e57_file_are_written_again(e57: Path, 
     (written,) = [path for path in e57.parent.rglob("*.png") if "pano_00_" in path.name]
     content = written.read_bytes()
     written.write_bytes(bytes(len(content)))  # as long
+    later = written.stat().st_mtime + 1
+    os.utime(e57, (later, later))
     read(e57)
     assert written.read_bytes() == content
+
+
+def test_pictures_that_were_edited_stay(e57: Path) -> None:
+    read(e57)
+    (written,) = [path for path in e57.parent.rglob("*.png") if "pano_00_" in path.name]
+    Image.fromarray(np.full((32, 64, 3), 7, np.uint8)).save(written)
+    later = e57.stat().st_mtime + 1
+    os.utime(written, (later, later))
+    scene = load(e57, split="all")
+    assert scene.train[0].load_pixels().unique().tolist() == [7]  # type: ignore[misc]
+    assert any(f"images: {written.name} differ from those of scan.e57, and are used" in note for note in scene.notes)
 
 
 def test_e57_files_without_panoramas_or_poses_are_refused(e57: Path, world: World) -> None:
