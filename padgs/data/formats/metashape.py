@@ -52,7 +52,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     chunks = root.findall("chunk") if root.tag == "document" else []
     if not chunks:
         raise DataError(f"{file} holds no <chunk> in a <document>; it must be an export of Metashape's cameras as XML")
-    chunk = max(chunks, key=lambda chunk: (_is_on(chunk), sum(map(_is_usable, chunk.iter("camera")))))
+    usable = {chunk: sum(map(_is_usable, chunk.iter("camera"))) for chunk in chunks}
+    chunk = max(chunks, key=lambda chunk: (usable[chunk] > 0, _is_on(chunk), usable[chunk]))
     notes = [f"{file.name} holds {len(chunks)} chunks; {chunk.get('label')!r} is used"] if len(chunks) > 1 else []
     folder = image_folder(file.parent, options.images)
     every = list(_cameras(chunk))
