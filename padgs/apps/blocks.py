@@ -14,7 +14,6 @@ import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -287,7 +286,6 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
             model_bytes=size.bytes,
             timing=times,
             peak_memory_bytes=max(end.peak_memory_bytes for end in ends),
-            finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         )
         result = store.finish(scored(config, scene, store, result, method) if scene.test else result)
     show_result(result, store.path, console)

@@ -10,7 +10,6 @@ import hashlib
 import re
 from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -303,7 +302,6 @@ def score_external(
             initial_result(config, scene, store.path.name),
             iterations=1,  # the least that a result can have; none was done here
             scores=scores,
-            finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             external={"program": program[0], "version": program[1], "label": label},
             **measured,
         )

@@ -9,7 +9,6 @@ import json
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -198,16 +197,12 @@ def scored(config: RunConfig, scene: Scene, store: RunStore, result: Result, met
 
 
 def _final(config: RunConfig, result: Result, progress: Progress) -> Result:
-    """Return the result with the number of iterations and the time."""
+    """Return the result with the number of iterations."""
     done = progress.iteration
     if result.ended == STOP_REQUESTED:
         result = replace(result, variant=", ".join(filter(None, (config.row, f"stopped after {done} iterations"))))
-    return replace(
-        result,
-        iterations=(config.budget.seconds is not None and done) or result.iterations,
-        iterations_done=done,
-        finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    )
+    iterations = (config.budget.seconds is not None and done) or result.iterations
+    return replace(result, iterations=iterations, iterations_done=done)
 
 
 def initial_result(config: RunConfig, scene: Scene, run: str) -> Result:

@@ -14,7 +14,7 @@ import shutil
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,8 +100,7 @@ class RunStore:
             except Timeout as error:
                 raise RunBusy(f"{self.path} is being worked on by {self._owner()}; it is left alone") from error
             try:
-                now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-                owner.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": now}))
+                owner.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": _now()}))
             except OSError:
                 self._lock.release()
                 raise
@@ -146,7 +145,7 @@ class RunStore:
     def finish(self, result: Result) -> Result:
         """Write result.json, which finishes the run; return the result as later readers see it."""
         with self._writing():
-            path = results.write(result, self.path)
+            path = results.write(replace(result, finished=result.finished or _now()), self.path)
             self.stop.unlink(missing_ok=True)  # it would stop the next start
         return results.read(path)
 
@@ -207,6 +206,10 @@ class RunStore:
             yield
         except OSError as error:
             raise cannot_write(self.path, error) from error
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def cannot_write(path: Path, error: OSError) -> RunFolderError:
