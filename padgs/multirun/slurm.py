@@ -11,12 +11,7 @@ TOO_MANY = re.compile(r"array|limit", re.IGNORECASE)  # of MaxArraySize, a QOS o
 
 
 class SubmissionRefused(Exception):
-    """Slurm takes none of these jobs; `too_many` if it may take fewer."""
-
-    @property
-    def too_many(self) -> bool:
-        """True if there is a limit on the number of jobs."""
-        return TOO_MANY.search(str(self)) is not None
+    """Slurm takes none of these jobs; it may take fewer if `TOO_MANY` finds a limit in the message."""
 
 
 def wait_for_jobs(jobs: Sequence[Any], stop_requested: Callable[[], bool]) -> list[int]:

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from padgs.checks import printable, typed
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import Board, JobState, Status, complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
-from padgs.multirun.slurm import SubmissionRefused, wait_for_jobs
+from padgs.multirun.slurm import TOO_MANY, SubmissionRefused, wait_for_jobs
 from padgs.results import Result, ResultError
 from padgs.runs.config import RunOptions
 from padgs.runs.console import Display, compact, duration, psnr_of, say, write
@@ -86,7 +87,7 @@ class Multirun:
         self.runs = Path(config.run.folder)
         self.board = Board(Path(config.hydra.sweep.dir))
         self._in_process = not in_own_process(config.hydra)
-        self._console, self._finished = console, FinishedJobs(self.runs)
+        self._console, self._say, self._finished = console, partial(say, console), FinishedJobs(self.runs)
         found = [self._finished.find(job) for job in jobs]
         if config.retry == "failed":
             found = [None if known and known[0] in RETRIED else known for known in found]
@@ -123,7 +124,7 @@ class Multirun:
             launched += len(batch)
             self._follow(batch)
             if isinstance(error, SubmissionRefused):
-                waiting, batch_size = batch + waiting, len(batch) // 2 if error.too_many else 0
+                waiting, batch_size = batch + waiting, len(batch) // 2 if TOO_MANY.search(str(error)) else 0
                 while not batch_size and waiting:
                     self._end(waiting.pop(0), JobState(Status.REFUSED, reason=str(error)))
                 continue
@@ -230,9 +231,6 @@ class Multirun:
         if found:
             what = "all" if any(result.experiments for _, result in found) else "runs"
             self._say(f"next: {shlex.join(['padgs', 'report', what, str(self.runs)])}")
-
-    def _say(self, text: str) -> None:
-        say(self._console, text)
 
 
 def status_line(before: Counter[str], states: Collection[JobState], seconds: float) -> str:
