@@ -86,10 +86,9 @@ class BudgetOptions:
 
     def asked(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, by key."""
-        time = {} if self.seconds is None else {"seconds": self.seconds, "clock": self.clock}
-        rest = {"gaussians": self.gaussians, "stop": self.stop}
+        clock = {} if self.seconds is None else {"clock"}  # which matters with seconds only
         usual = asdict(BudgetOptions())
-        return {**time, **{name: value for name, value in rest.items() if value != usual[name]}}
+        return {name: value for name, value in asdict(self).items() if value != usual[name] or name in clock}
 
 
 @dataclass(frozen=True)

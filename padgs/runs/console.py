@@ -72,12 +72,12 @@ class Display:
         """True if it is time to redraw."""
         return time.monotonic() - self._shown >= self._interval
 
-    def show(self, line: str, picture: RenderableType | None = None) -> None:
-        """Show a line, or a picture if there is one and the console is a terminal."""
+    def show(self, line: str) -> None:
+        """Show a line."""
         self._shown = time.monotonic()
         with suppress(*UNREAD):
             if self._live is not None:
-                self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
+                self._live.update(Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
             else:
                 self._console.print(line, highlight=False, soft_wrap=True)
 
