@@ -266,19 +266,8 @@ def _training_seconds(result: Result) -> float | None:
     return wall if result.machine.get("gpu") else result.timing.get("cpu_seconds", wall)
 
 
-SAME = (
-    "run",
-    "ok",
-    "status",
-    "method",
-    "variant",
-    "dataset",
-    "scene",
-    "seed",
-    "iterations",
-    "code_version",
-    "finished",
-)
+SAME = ("run", "ok", "status", "method", "variant", "dataset", "scene", "seed", "iterations")
+SAME += ("code_version", "finished")
 FACTS: Mapping[str, Callable[[Result], Any]] = {
     **{name: attrgetter(name) for name in SAME},
     "preset": lambda result: f"{EXTERNAL}{result.external['label']}" if result.external else result.preset,

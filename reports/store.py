@@ -23,7 +23,6 @@ FILE_NAME = "results.jsonl"
 PATIENCE = 120  # seconds for other reports that add runs to the same store
 LOGGED = ("iteration", "seconds", "psnr")  # seconds of training so far; dB
 LOGGED_BY_SOME = ("polar_transmittance",)  # measured for PaD-GS only
-NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Run:
     """A finished run: result, log, and folder of renders."""
 
     result: Result
-    log: Mapping[str, Sequence[float]] = field(default_factory=lambda: NO_LOG)  # name of `LOGGED` -> its values
+    log: Mapping[str, Sequence[float]] = field(default_factory=lambda: dict.fromkeys(LOGGED, ()))  # of `LOGGED`
     document: Mapping[str, Any] | None = None  # content of the result file
     renders: Path | None = None  # folder of ground truth | render | error of each test view; None in a store
 
@@ -54,7 +53,8 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
         loads = {f"{source}:{number}": partial(_from_line, line) for number, line in lines}
     else:
         distinct: dict[Path, Path] = {}  # without links to runs beside them
-        for path in sorted(source.glob(f"*/{results.FILE_NAME}"), key=_rank):
+        found = source.glob(f"*/{results.FILE_NAME}")
+        for path in sorted(found, key=lambda file: (file.parent.is_symlink(), len(file.parent.name), file)):
             distinct.setdefault(path.resolve(), path)
         loads = {str(path): partial(_from_folder, path) for path in distinct.values()}
     runs: dict[str, Run] = {}
@@ -68,10 +68,6 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
         except ResultError as error:
             errors.append(error)
     return [runs[name] for name in sorted(runs)], errors
-
-
-def _rank(file: Path) -> tuple[bool, int, Path]:
-    return file.parent.is_symlink(), len(file.parent.name), file
 
 
 def _usable(run: Run, where: str) -> Run:
