@@ -62,9 +62,8 @@ def refuse_missing(path: Path, dataset: str | None) -> None:
             f"its scenes: {listed(map(known.place, known.scenes), most=30)}"
         )
     what, folder, holds = f"the scene {scene!r} of {known.title}", path, "this folder holds"
-    if not (
-        top := path.parents[known.nested]
-    ).exists():  # the same message for all scenes, which a multirun prints once
+    top = path.parents[known.nested]
+    if not top.exists():  # the same message for all scenes, which a multirun prints once
         what, folder, holds = known.title, top, "the folder of each scene holds"
     raise DataError(
         f"{what} is missing. Get it from {known.source}, and put it into {folder.absolute()}, so that {holds} "

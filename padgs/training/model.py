@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -162,14 +163,11 @@ class Refined:
 
     def groups(self) -> list[ParameterGroup]:
         """Return the parameter groups of the model with the learning rates of a refinement."""
-        return [replace(g, learning_rate=self._rate(g), paced=False) for g in self._model.groups()]
+        return [replace(g, learning_rate=partial(self._rate, g), paced=False) for g in self._model.groups()]
 
-    def _rate(self, group: ParameterGroup) -> Callable[[int], float]:
-        def rate(step: int) -> float:
-            iteration: Any = self._iterations - REPLAYED * (self._iterations - step)  # schedules take floats, too
-            return group.rate(iteration, self._pace)
-
-        return rate
+    def _rate(self, group: ParameterGroup, step: int) -> float:
+        iteration: Any = self._iterations - REPLAYED * (self._iterations - step)  # schedules take floats, too
+        return group.rate(iteration, self._pace)
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Do nothing: without densification no statistics are needed."""
