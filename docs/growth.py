@@ -48,9 +48,8 @@ def measure(width: int, count: int) -> tuple[float, int]:
     scene = Scene("growth", tuple(map(view, range(VIEWS))), (), points, colors, fingerprint="")
     off = ("initial_per_pixel=null", "limit_per_pixel=null", "depth_init_per_pixel=0", "coarse_share=0")
     method = make_method("padgs_plus", *(f"method.{option}" for option in (*off, "sky_per_point=0", "sh_degree=2")))
-    records, times = method.fit(scene, Budget(100_000)), []  # the first round of densification is far away
-    for _ in range(WARM_UP + ITERATIONS):
-        times.append(next(records).cpu_seconds)
+    records = method.fit(scene, Budget(100_000))  # the first round of densification is far away
+    times = [next(records).cpu_seconds for _ in range(WARM_UP + ITERATIONS)]
     assert method.model.counts()["gaussians"] == count, method.model.counts()
     return statistics.median(np.diff(times)[WARM_UP - 1 :]), peak_memory()["peak_memory_bytes"]
 
