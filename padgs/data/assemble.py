@@ -13,17 +13,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import (
-    OTHERS,
-    Capture,
-    DataError,
-    DataOptions,
-    Frame,
-    UnknownLens,
-    first_of,
-    listed,
-    view_name,
-)
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on

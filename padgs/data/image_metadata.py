@@ -156,14 +156,10 @@ def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[
 @lru_cache(maxsize=16)
 def _icc_conversion(profile: bytes) -> Callable[[Image.Image], Image.Image] | None:
     """Return the conversion by an ICC profile of RGB colours; None if that is sRGB, by what it does to colours."""
-    transform = ImageCms.buildTransform(
-        ImageCms.ImageCmsProfile(BytesIO(profile)),
-        ImageCms.createProfile("sRGB"),
-        "RGB",
-        "RGB",
-        ImageCms.Intent.RELATIVE_COLORIMETRIC,
-        ImageCms.Flags.NOCACHE,  # the cache is not made for several threads
-    )
+    given, srgb = ImageCms.ImageCmsProfile(BytesIO(profile)), ImageCms.createProfile("sRGB")
+    # The cache is not made for several threads.
+    how = (ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.NOCACHE)
+    transform = ImageCms.buildTransform(given, srgb, "RGB", "RGB", *how)
     steps = np.arange(0, 256, 15, dtype=np.uint8)
     colors = Image.fromarray(np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3))
     converted = ImageCms.applyTransform(colors, transform)

@@ -189,17 +189,13 @@ def gps_of(image: Path) -> tuple[float, float, float] | None:
     with open_image(image) as opened:
         tags = opened.getexif().get_ifd(ExifTags.IFD.GPSInfo)
     try:
-        angles = [
-            sum(float(part) / 60**k for k, part in enumerate(tags[value]))
-            * (-1 if str(tags[side])[:1].upper() in {"S", "W"} else 1)
-            for value, side in (
-                (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef),
-                (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef),
-            )
-        ]
-        altitude = float(tags.get(ExifTags.GPS.GPSAltitude, 0.0))
+        gps, angles = ExifTags.GPS, []
+        for value, side in ((gps.GPSLatitude, gps.GPSLatitudeRef), (gps.GPSLongitude, gps.GPSLongitudeRef)):
+            angle = sum(float(part) / 60**k for k, part in enumerate(tags[value]))
+            angles.append(-angle if str(tags[side])[:1].upper() in {"S", "W"} else angle)
+        altitude = float(tags.get(gps.GPSAltitude, 0.0))
         altitude = altitude if math.isfinite(altitude) else 0.0  # some cameras write 0/0
-        if tags.get(ExifTags.GPS.GPSAltitudeRef) in (b"\x01", 1):  # below the sea
+        if tags.get(gps.GPSAltitudeRef) in (b"\x01", 1):  # below the sea
             altitude = -altitude
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None

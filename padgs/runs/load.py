@@ -130,14 +130,10 @@ class LoadedRun:
         if isinstance(camera, Pinhole):
             panoramic = settings.projection == "erp" or settings.cubemap
             angular = panoramic and settings.low_pass_kind in ("auto", "pixels")
-            settings = replace(
-                settings,
-                projection="pinhole" if panoramic else settings.projection,
-                low_pass_kind="angular" if angular else settings.low_pass_kind,
-                cubemap=False,
-                bounds="exact",
-                wrap=True,
-            )
+            projection = "pinhole" if panoramic else settings.projection
+            kind = "angular" if angular else settings.low_pass_kind
+            exact = {"cubemap": False, "bounds": "exact", "wrap": True}
+            settings = replace(settings, projection=projection, low_pass_kind=kind, **exact)
         finer = max(1.0, camera.focal / trained.focal)
         if not isinstance(camera, Panorama):
             finer /= self.method.CUT_FINENESS

@@ -86,16 +86,8 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
     blank = Splats(zeros(0, 3), zeros(0, 3), zeros(0, 3), degree=DEGREE, scene_scale=unit)
     rest = zeros(len(keep), (DEGREE + 1) ** 2 - 1, 3)
     rest[:, : size - 1] = coefficients[:, 1:]
-    blank.load(
-        {
-            "means": model.centers()[keep],
-            "quats": quats,
-            "log_scales": scales.log(),
-            "opacity_logits": torch.logit(opacities),
-            "sh_dc": coefficients[:, 0],
-            "sh_rest": rest,
-        }
-    )
+    shapes = {"means": model.centers()[keep], "quats": quats, "log_scales": scales.log()}
+    blank.load(shapes | {"opacity_logits": torch.logit(opacities), "sh_dc": coefficients[:, 0], "sh_rest": rest})
     blank.active_degree = DEGREE
     return blank
 

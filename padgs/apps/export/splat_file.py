@@ -124,16 +124,9 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
     quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
     quats[~quats.any(1), 0] = 1  # no rotation
-    splats.load(
-        {
-            "means": columns("x", "y", "z"),
-            "quats": quats,
-            "log_scales": columns("scale_0", "scale_1", "scale_2"),
-            "opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT),
-            "sh_dc": columns("f_dc_0", "f_dc_1", "f_dc_2"),
-            "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2),
-        }
-    )
+    rows = {"means": columns(*_POSITION), "log_scales": columns("scale_0", "scale_1", "scale_2"), "quats": quats}
+    rows |= {"sh_dc": columns(*_COLOR), "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2)}
+    splats.load(rows | {"opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT)})
     splats.active_degree = degree
     return widened(splats, columns("filter_3D")[:, 0].square()) if "filter_3D" in names else splats
 

@@ -45,20 +45,14 @@ def extract_features(
     cameras = _register(database, groups)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
     extraction.sift.peak_threshold, extraction.sift.max_num_features = PEAK_THRESHOLD, MAX_FEATURES
+    single = {"camera_mode": pycolmap.CameraMode.SINGLE, "extraction_options": extraction}
     total, done = sum(len(group.names) for group in groups), 0
     for group, camera_id in zip(groups, cameras, strict=True):
         reader = pycolmap.ImageReaderOptions(existing_camera_id=camera_id)
         if masks is not None:
             reader.mask_path = masks
         for batch in _batches(group.names, 2 * threads):
-            pycolmap.extract_features(
-                database,
-                folder,
-                image_names=list(batch),
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=extraction,
-            )
+            pycolmap.extract_features(database, folder, image_names=list(batch), reader_options=reader, **single)
             done += len(batch)
             progress(done, total)
 
@@ -109,16 +103,12 @@ def match(
     matching.rig_verification = matching.skip_image_pairs_in_same_frame = rig
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    file = database.with_name("pairs.txt")
-    done = 0
+    options = {"matching_options": matching, "verification_options": verification}
+    file, done = database.with_name("pairs.txt"), 0
     for batch in _batches(pairs, max(1, _PAIRS_PER_BATCH // len(pairs[0]))):
         file.write_text("".join(f"{a} {b}\n" for group in batch for a, b in group), encoding="utf-8")
-        pycolmap.match_image_pairs(
-            database,
-            matching_options=matching,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=file),
-            verification_options=verification,
-        )
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=file)
+        pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
         done += len(batch)
         progress(done, len(pairs))
     file.unlink(missing_ok=True)
