@@ -26,10 +26,9 @@ def split(
 
     check_range(2, 10_000, blocks=blocks)
     destination = Path(to or f"{os.path.abspath(source)}-blocks")  # also of "."
+    options = DataOptions(mask=mask, split=split, images=images or None)
     with name_place(destination):
-        lines = write(
-            Path(source), destination, blocks, format, DataOptions(mask=mask, split=split, images=images or None)
-        )
+        lines = write(Path(source), destination, blocks, format, options)
     for line in lines:
         show(line)
     names = ",".join(line.partition(": ")[0] for line in lines)

@@ -145,7 +145,8 @@ def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
         transparent = _is_transparent(image)
         convert = image_metadata.srgb_conversion(image, data, path) if mode == "RGB" else None
         crop, stored = image_metadata.crop_of(image, path), _eight_bit(image).convert(mode)
-        is_coloured = mode == "L" and image.mode in _COLOUR and _is_coloured(image)
+        spread = np.ptp(np.asarray(image.convert("RGB")), axis=-1) if mode == "L" and image.mode in _COLOUR else 0
+        is_coloured = np.mean(spread > COLOURED) > 1e-3  # whose brightness means nothing; JPEG leaves a few faint ones
         cut = _misses_pixels(image, data, np.asarray(stored))
         pixels = np.array(stored if convert is None else convert(stored))
     if cut:
@@ -193,11 +194,6 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     if values.max(initial=0) > 255:  # else it holds 8 bits
         values >>= 8
     return Image.fromarray(values.clip(0, 255).astype(np.uint8))
-
-
-def _is_coloured(image: Image.Image) -> bool:
-    """Return whether a mask has colours, whose brightness means nothing; JPEG leaves a few faint ones."""
-    return bool((np.ptp(np.asarray(image.convert("RGB")), axis=-1) > COLOURED).mean() > 1e-3)
 
 
 def read_bytes(path: Path, *, empty: bool = False) -> bytes:
