@@ -12,8 +12,6 @@ from padgs.checks import printable
 
 METHODS = yaml.safe_load(Path(__file__).with_name("methods.yaml").read_text("utf-8"))
 STATUS = {preset: words for method in METHODS.values() for preset, words in method.get("presets", {}).items()}
-
-
 COLOR = re.compile("#[0-9a-fA-F]{6}")
 EXTERNAL = "external: "  # presets of models and renders that another program made begin with it; their label follows
 

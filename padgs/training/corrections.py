@@ -29,7 +29,6 @@ from padgs.training.targets import Target
 if TYPE_CHECKING:
     from padgs.training.options import TrainOptions
 
-
 GIVEN, LEARNED, LEARNED_FAST = "given", "learned", "learned_fast"
 CHOICES = (GIVEN, LEARNED)  # of exposures
 # Learning rates of poses at the first and the last iteration: of unit quaternions, and of translations in scene scales.
