@@ -37,7 +37,6 @@ class ODGSModel(SplatModel):
     options: ODGSOptions
 
     def __init__(self, splats: Splats, options: ODGSOptions, *args: Any, **kwargs: Any) -> None:
-        """Take arguments of `SplatModel`."""
         super().__init__(splats, options, *args, **kwargs)
         self.densifier.extent += options.extent_margin
 

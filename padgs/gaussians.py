@@ -23,7 +23,6 @@ class Gaussians:
     colors: Tensor  # [N, 3]
 
     def __len__(self) -> int:
-        """Return the number of Gaussians."""
         return self.means.shape[0]
 
     def first(self, count: int) -> Gaussians:

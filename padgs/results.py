@@ -85,7 +85,6 @@ class Result:
     cameras: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Reject a status that is not in STATUSES."""
         if self.status not in STATUSES:
             raise ValueError(f"unknown status {self.status!r}; known: {', '.join(STATUSES)}")
 

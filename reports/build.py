@@ -168,7 +168,6 @@ class _Builder:
         theirs: Mapping[str, Mapping[str, Published]],
         runs: DataFrame,
     ) -> tuple[Row, ...]:
-        """Return a row for each value, with published numbers and differences."""
         first, rows = next(iter(cells.values()), ()), []
         for value, ours in cells.items():
             comparable = as_published(runs.loc[runs[self.spec.rows] == value])

@@ -244,5 +244,4 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, 
 
 
 def _numbers(claim: Claim, runs: DataFrame) -> Any:
-    """Return the numbers of successful runs."""
     return runs.loc[runs["ok"]].reindex(columns=[claim.metric])[claim.metric].dropna().astype(float)

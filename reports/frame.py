@@ -200,7 +200,6 @@ def _rules(result: Result) -> Iterator[tuple[str, str]]:
 
 
 def _length(result: Result) -> str:
-    """Return the requested length: iterations, or time."""
     budget = result.config.get("budget", {})
     if "seconds" not in budget:
         return f"{result.iterations} iterations"
@@ -216,7 +215,6 @@ def _learning_rates(result: Result) -> Any:
 
 
 def _factor(result: Result) -> float | None:
-    """Return the factor on all learning rates."""
     choice = result.config.get("train", {}).get("learning_rates", "published")
     if not result.iterations:
         return None

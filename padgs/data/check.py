@@ -242,7 +242,6 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
 
 
 def _check_exposures(scene: Scene, report: Report) -> None:
-    """Measure how differently the training views are exposed."""
     views = scene.train[:: -(-len(scene.train) // EXPOSURE_VIEWS)]
     if len(views) < 2:
         return

@@ -180,7 +180,6 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
 
 
 def _may_be_whole(file: Path) -> bool:
-    """Return whether a depth map may hold integers."""
     if file.suffix.lower() != ".npy":
         return file.suffix.lower() != ".exr"
     with refused_if_damaged(file):

@@ -33,8 +33,6 @@ class _Resampled:
 
 
 class _Pixels(_Resampled):
-    """Loader of the colours of a view."""
-
     @property
     def store(self) -> ImageStore | None:
         return self.load.store if isinstance(self.load, StoredImage) else None
@@ -64,8 +62,6 @@ class _Pixels(_Resampled):
 
 
 class _Mask(_Resampled):
-    """Loader of the mask of a view."""
-
     def __call__(self) -> Tensor:
         """Return weights [H, W] in [0, 1]."""
         mask = self.load()[..., None]

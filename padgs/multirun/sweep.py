@@ -196,7 +196,6 @@ class Multirun:
             display.show(self.line())
 
     def _follow(self, indices: Iterable[int]) -> None:
-        """Read the states of jobs from the board."""
         for index in list(indices):
             state = self.board.read(self._numbers[index])
             if state != self.states[index]:

@@ -197,7 +197,6 @@ def scored(config: RunConfig, scene: Scene, store: RunStore, result: Result, met
 
 
 def _final(config: RunConfig, result: Result, progress: Progress) -> Result:
-    """Return the result with the number of iterations."""
     done = progress.iteration
     if result.ended == STOP_REQUESTED:
         result = replace(result, variant=", ".join(filter(None, (config.row, f"stopped after {done} iterations"))))

@@ -107,7 +107,6 @@ class RunStore:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release the lock."""
         with suppress(OSError):
             (self.path / OWNER).unlink()
         self._lock.release()

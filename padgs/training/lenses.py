@@ -47,7 +47,6 @@ class CameraMap(nn.Module):
     _pixels: Tensor  # [H, W, 2]
 
     def __init__(self, width: int, height: int, *, dtype: torch.dtype = torch.float32) -> None:
-        """Build the ideal camera."""
         super().__init__()
         self.width, self.height = width, height
         self.focal = nn.Parameter(torch.ones(3, dtype=dtype))

@@ -229,7 +229,6 @@ def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, presets: Seque
 
 
 def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
-    """Draw the Pareto front of points, up to the end of the axis."""
     corners = pareto(points)
     corners += [(max(panel.get_xlim()[1], corners[-1][0]), corners[-1][1])] if corners else []
     steps = [*corners[:1], *(at for (_, y), (x, top) in pairwise(corners) for at in ((x, y), (x, top)))]
@@ -248,7 +247,6 @@ def _label(panel: Any, marks: Sequence[Mark]) -> list[Any]:
 
 
 def _handles(marks: Sequence[Mark]) -> list[Any]:
-    """Return the legend of what is drawn."""
     from matplotlib.lines import Line2D
 
     def dot(area: float, label: str, **look: Any) -> Line2D:

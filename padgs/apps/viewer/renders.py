@@ -38,7 +38,6 @@ class RunRenderer:
     """Renderer of a run: of a finished one, or of the newest checkpoint of one that was in training at first."""
 
     def __init__(self, run: LoadedRun) -> None:
-        """Prepare the caches."""
         self.run, self._is_following, self._failure = run, run.result is None, ""
         self._method = lru_cache(maxsize=2)(self._method_for)
         self._error = lru_cache(maxsize=8)(self._error_image)

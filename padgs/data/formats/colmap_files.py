@@ -178,8 +178,6 @@ def _observations(line: str) -> NDArray[np.float64] | None:
 
 
 class _Cursor:
-    """Position in a binary file."""
-
     def __init__(self, file: Path) -> None:
         self.data, self.offset = read_bytes(file), 0
 

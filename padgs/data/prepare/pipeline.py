@@ -101,8 +101,6 @@ def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepa
 
 
 class _Job:
-    """A preparation in its working folder."""
-
     def __init__(
         self, source: Path, destination: Path, place: Path, options: PrepareOptions, progress: Progress
     ) -> None:

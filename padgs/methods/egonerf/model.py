@@ -28,7 +28,6 @@ class EgoNeRFModel:
     """An EgoNeRF with the schedule of a run; trained by `RayTrainer`."""
 
     def __init__(self, field: EgoNeRF, iterations: int) -> None:
-        """Wrap a radiance field for a run of `iterations`."""
         self.field, self._options, self._iterations = field, field.options, iterations
 
     def groups(self) -> list[ParameterGroup]:

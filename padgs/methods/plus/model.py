@@ -36,7 +36,6 @@ class PlusModel(SplatModel):
     """Splats with the schedule of padgs_plus for a run of `iterations`."""
 
     def __init__(self, splats: Splats, options: PlusOptions, config: RenderConfig, **kwargs: Any) -> None:
-        """Take arguments of `SplatModel`."""
         views = kwargs.get("views", ())
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
         count = round(sum(view.sphere_share for view in views))
