@@ -36,6 +36,7 @@ SKIPPED = ((PREPARED,), ("config.yaml", "renders"))
 
 def assemble(capture: Capture, options: DataOptions) -> Scene:
     """Build the scene of a capture; a DataError if training cannot use it. Images are checked, but not decoded."""
+    refuse_clashes([frame.name for frame in capture.frames])
     capture = _without_unlisted(capture, options)
     # Panoramas first: the first view stands for all where only one is looked at.
     frames = sorted(capture.frames, key=lambda frame: (frame.lens is not None, frame.name))
@@ -53,7 +54,6 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
             "beside panoramas (EQUIRECTANGULAR) only: reconstruct from the panoramas themselves (`padgs prepare`), or "
             "give the sparse_equirectangular model" + "".join(f"; {note}" for note in capture.notes if OTHERS in note)
         )
-    refuse_clashes(names)
     _refuse_missing(capture)
     images = [inspect(frame.image, panorama=frame.lens is None) for frame in capture.frames]
     notes = [*capture.notes, *unit_note(capture.folder), *_camera_notes(capture.frames, images), *notes_on(images)]

@@ -174,15 +174,24 @@ class Search:
         """Return the configuration of the run that prunes to `count` rows and refines them without one fold."""
         config, views = self.run.config, len(self.run.scene.train) - max(map(len, self.folds))
         schedule = self.run.method.state().values["schedule"]  # of a budget of seconds it is known afterwards
-        rates = Pace.of(self.run.method.train_options.learning_rates, schedule).factor
-        train = replace(config.train, iterations=max(views, round(REFINED * schedule)), learning_rates=rates)
-        # Without a monitor: in so few iterations, views that differ look like divergence.
-        train = replace(train, refine=True, hold_out=hold_out, max_seconds=None, monitor=False)
-        budget = BudgetOptions(gaussians=None if count == self.rows else count)
-        options = replace(config.run, folder=folder, pictures=config.run.pictures and hold_out is None)
-        init, protocols = WarmStart.of(str(self.run.folder), config.method), {RULES.name: TEST_RULES}
-        config = replace(config, train=train, budget=budget, run=options, init=init, protocols=protocols)
-        return replace(config, labels=Labels(self._result.preset))
+        train = replace(
+            config.train,
+            iterations=max(views, round(REFINED * schedule)),
+            learning_rates=Pace.of(self.run.method.train_options.learning_rates, schedule).factor,
+            refine=True,
+            hold_out=hold_out,
+            max_seconds=None,
+            monitor=False,  # in so few iterations, views that differ look like divergence
+        )
+        return replace(
+            config,
+            train=train,
+            budget=BudgetOptions(gaussians=None if count == self.rows else count),
+            init=WarmStart.of(str(self.run.folder), config.method),
+            run=replace(config.run, folder=folder, pictures=config.run.pictures and hold_out is None),
+            protocols={RULES.name: TEST_RULES},
+            labels=Labels(self._result.preset),
+        )
 
     def _trained(self, config: RunConfig, stop_requested: Callable[[], bool]) -> Result:
         start(config)

@@ -215,9 +215,7 @@ def test_masks_may_be_smaller_than_images_but_not_than_views(folder: Path) -> No
     Image.fromarray(np.repeat([255, 0], (12, 4)).astype(np.uint8)[:, None].repeat(32, 1)).save(folder / "mask.png")
     mask = load(folder, width=16).train[0].mask()
     assert mask is not None and mask.shape == (8, 16) and mask[:6].eq(1).all() and mask[6:].eq(0).all()
-    with pytest.raises(
-        DataError, match=r"mask.png is 32x16 .* no smaller than the view \(64x32, data.width\)"
-    ):
+    with pytest.raises(DataError, match=r"mask.png is 32x16 .* no smaller than the view \(64x32, data.width\)"):
         load(folder)
 
 

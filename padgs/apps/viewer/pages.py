@@ -171,10 +171,18 @@ class Page:
             answer.on_click(lambda _: question.close())
 
     def _frustum(self, view: View) -> Any:
-        place = {"wxyz": wxyz_of(view.cam_from_world[:3, :3].mT.cpu().numpy()), "position": view.center.cpu().numpy()}
-        look = {"color": (40, 120, 220), "thickness": 1.5, "thickness_units": "screen", "visible": False}
-        size = {"fov": 1.0, "aspect": 1.5, "scale": 0.05 * self._renderers[0].run.scene.scale}
-        frustum = self._client.scene.add_camera_frustum(f"/cameras/{view.name}", **size, **look, **place)
+        frustum = self._client.scene.add_camera_frustum(
+            f"/cameras/{view.name}",
+            fov=1.0,
+            aspect=1.5,
+            scale=0.05 * self._renderers[0].run.scene.scale,
+            thickness=1.5,
+            thickness_units="screen",
+            color=(40, 120, 220),
+            wxyz=wxyz_of(view.cam_from_world[:3, :3].mT.cpu().numpy()),
+            position=view.center.cpu().numpy(),
+            visible=False,
+        )
         frustum.on_click(lambda _: self.go_to(view))
         return frustum
 
