@@ -77,7 +77,7 @@ def test_names_that_differ_in_case_only_and_second_poses_are_refused(folder: Pat
     with pytest.raises(DataError, match="the image 'pano_02.png' has two poses; remove one"):
         load(folder)
     (folder / "sparse/0/images.txt").write_text(lines.replace("pano_03.png", "PANO_02.jpg"))
-    with pytest.raises(DataError, match="'PANO_02.jpg' and 'pano_02.png' would share one name"):
+    with pytest.raises(DataError, match="'pano_02.png' and 'PANO_02.jpg' would share one name"):
         load(folder)
 
 
