@@ -93,7 +93,8 @@ def best_reading(capture: Capture) -> Capture:
             best = readings[fits.index(max(fits))]
         why = f"colours agree by {max(fits):.2f}"
         if max(fits) <= MIN_CORRELATION:
-            inside = [_share_inside(one.axes @ poses, _moved(cloud.points, one)) if cloud else 0.0 for one in readings]
+            points = cloud.points if cloud else torch.zeros(0, 3)
+            inside = [_share_inside(one.axes @ poses, _moved(points, one)) for one in readings]
             best, why = readings[inside.index(max(inside))], "not tested by colours"
         notes.append(f"{best.words}: {why}")
     frames = (replace(frame, cam_from_world=best.axes @ frame.cam_from_world) for frame in capture.frames)
@@ -102,7 +103,9 @@ def best_reading(capture: Capture) -> Capture:
 
 
 def _share_inside(poses: Tensor, points: Tensor) -> float:
-    """Return the share of cameras in the box around nine tenths of the points, axis by axis."""
+    """Return the share of cameras in the box around nine tenths of the points, axis by axis; 0 without points."""
+    if not len(points):
+        return 0.0
     low, high = (points[:: max(1, len(points) // POINTS)].double().quantile(q, 0) for q in (0.05, 0.95))
     positions = centers(poses)
     return ((positions >= low) & (positions <= high)).all(1).double().mean().item()

@@ -68,6 +68,13 @@ def test_points_without_colours_are_those_of_the_world_unless_they_miss_the_came
     torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
 
 
+@pytest.mark.parametrize("colors", [None, torch.zeros(0, 3, dtype=torch.uint8)])
+def test_an_empty_cloud_is_refused_by_name(colors: torch.Tensor | None, folder: Path) -> None:
+    write_ply(folder / "dense.ply", Cloud(torch.zeros(0, 3, dtype=torch.float64), colors))
+    with pytest.raises(DataError, match="holds no points; training starts from a point cloud"):
+        load(folder)
+
+
 def test_a_disabled_chunk_is_not_used(folder: Path) -> None:
     text = (folder / "cameras.xml").read_text()
     chunk = re.search(r"<chunk .*</chunk>", text, re.DOTALL)[0]  # type: ignore[index]
