@@ -86,9 +86,10 @@ class BudgetOptions:
 
     def asked(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, by key."""
-        clock = {} if self.seconds is None else {"clock"}  # which matters with seconds only
+        time = {} if self.seconds is None else {"seconds": self.seconds, "clock": self.clock}
+        rest = {"gaussians": self.gaussians, "stop": self.stop}
         usual = asdict(BudgetOptions())
-        return {name: value for name, value in asdict(self).items() if value != usual[name] or name in clock}
+        return {**time, **{name: value for name, value in rest.items() if value != usual[name]}}
 
 
 @dataclass(frozen=True)
