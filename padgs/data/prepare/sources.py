@@ -76,20 +76,20 @@ def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[ND
             for index, frame in enumerate(container.decode(stream)):
                 time = index / rate if frame.time is None else frame.time
                 start = time if start is None else start
-                pixels = _pixels(frame, video)
                 if index == 0:  # before an hour of decoding
+                    pixels = _pixels(frame, video)
                     image_files.refuse_other_shapes(pixels.shape[1], pixels.shape[0], video)
                     refuse_dual_fisheye(pixels, video)
                 progress(index + 1, max(total, index + 1))
                 now = int((time - start) * per_second + 1e-6)
                 if best is not None and now != interval:
-                    yield best
+                    yield _pixels(best, video)
                     best, best_sharpness = None, -1.0
-                if (sharp := sharpness(pixels)) > best_sharpness:
-                    best, best_sharpness = pixels, sharp
+                if (sharp := sharpness(frame.to_ndarray(format="gray"))) > best_sharpness:
+                    best, best_sharpness = frame, sharp
                 interval = now
         if best is not None:
-            yield best
+            yield _pixels(best, video)
     except DataError:  # not panoramas
         raise
     except (av.error.FFmpegError, OSError, ValueError, RuntimeError) as error:
@@ -107,16 +107,20 @@ def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
             if tuple(np.frombuffer(bytes(side), np.int32, len(numbers)).tolist()) != numbers:
                 raise DataError(f"{video} says that it is {otherwise}")
     is_hd = frame.height > _SD_HEIGHT and frame.colorspace == _UNTAGGED
-    return frame.to_ndarray(format="rgb24", src_colorspace="ITU709" if is_hd else None)
+    flags = optional_module("av", video, "video").video.reformatter.Interpolation
+    exact = None  # PyAV before 16 rounds down, up to 2 of 255
+    if hasattr(flags, "ACCURATE_RND"):
+        exact = flags.BICUBIC | flags.ACCURATE_RND | flags.FULL_CHR_H_INT
+    return frame.to_ndarray(format="rgb24", src_colorspace="ITU709" if is_hd else None, interpolation=exact)
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:
-    """Return the mean absolute Laplacian of a frame [H, W, 3]; higher is sharper. Comparable within one video only.
+    """Return the mean absolute Laplacian of a gray frame [H, W]; higher is sharper. Comparable within one video only.
 
-    >>> sharpness(np.full((8, 16, 3), 7, np.uint8))
+    >>> sharpness(np.full((8, 16), 7, np.uint8))
     0.0
     """
-    gray = frame[::2, ::2, 1].astype(np.int16)
+    gray = frame[::2, ::2].astype(np.int16)
     around = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:]
     return float(np.abs(4 * gray[1:-1, 1:-1] - around).mean())
 

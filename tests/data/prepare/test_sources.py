@@ -118,7 +118,7 @@ def test_bad_input_is_refused(tmp_path):
 
 def test_videos_are_recognised_by_suffix_and_blur_lowers_sharpness(tmp_path):
     assert is_video(tmp_path / "Tour.MP4") and not is_video(tmp_path / "tour.jpg")
-    noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (64, 128), np.uint8)
     blurred = ((noise + np.roll(noise, 2, 0) + np.roll(noise, 2, 1).astype(int)) // 3).astype(np.uint8)
     assert sharpness(noise) > 1.3 * sharpness(blurred) > sharpness(np.full_like(noise, 9))
 
@@ -174,13 +174,17 @@ def test_frames_are_chosen_by_time_at_a_variable_rate(tmp_path):
     assert [int((value - 38) / 25) for value in brightness] == [*range(8)]
 
 
-@pytest.mark.parametrize(("height", "matrix"), [(576, "ITU601"), (578, "ITU709")])
-def test_untagged_videos_have_the_colours_that_players_show(tmp_path, height, matrix):
-    av, painted = pytest.importorskip("av", reason="the extra `video` is not installed"), (200, 60, 40)
-    pixels = np.full((height, 2 * height, 3), painted, np.uint8)
+@pytest.mark.parametrize(("height", "matrix"), [(576, "ITU601"), (592, "ITU709")])
+def test_untagged_videos_have_the_colours_that_players_show(height, matrix):
+    av = pytest.importorskip("av", reason="the extra `video` is not installed")
+    painted = np.random.default_rng(0).integers(0, 256, (height // 16, height // 8, 3), np.uint8)
+    pixels = painted.repeat(16, 0).repeat(16, 1)
     frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p", dst_colorspace=matrix)
     frame.colorspace = 2
-    assert np.abs(_pixels(frame, Path("a.mp4"))[::50, ::50].astype(int) - painted).max() <= 2
+    error = _pixels(frame, Path("a.mp4"))[8::16, 8::16].astype(int) - painted
+    assert np.abs(error).max() <= 3
+    if hasattr(av.video.reformatter.Interpolation, "ACCURATE_RND"):  # others are darker by 1
+        assert np.abs(error.mean((0, 1))).max() < 0.5
 
 
 @pytest.mark.parametrize(
@@ -193,6 +197,8 @@ def test_untagged_videos_have_the_colours_that_players_show(tmp_path, height, ma
     ],
 )
 def test_videos_that_are_not_upright_panoramas_of_one_eye_are_refused(name, numbers, message):
+    pytest.importorskip("av", reason="the extra `video` is not installed")
+
     class Side(bytes):
         type = SimpleNamespace(name=name)
 
