@@ -220,7 +220,8 @@ class _Builder:
         columns = self._columns()
         for measure in self.measures:
             start, rows = columns.index(measure.column), []
-            kinds = ["", *(column.title for column in columns[start + 1 : start + 3] if self.paper)]
+            beside = (measure.published is not None) * (1 + measure.difference) if self.paper else 0
+            kinds = ["", *(column.title for column in columns[start + 1 :][:beside])]
             for place, block in blocks.items():
                 by_title = {row.title: row.cells for row in block.rows}
                 for offset, kind in enumerate(kinds):  # ours, the paper's and the difference

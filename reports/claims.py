@@ -26,6 +26,7 @@ NOT_REPRODUCED = "not reproduced"  # at sizes or lengths that are not the paper'
 UNDECIDED, UNMEASURED = "undecided", "not measured"
 LEAST_SEEDS = 2  # of both sides, for a scene to be tested
 OURS = "this project"  # source of claims that are not the paper's
+OTHER_PATH = "-other-path"  # in the name of a generated scene that is seen from other positions
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,9 @@ class Claim:
         return difference if higher else -difference
 
     def show(self, advantage: float) -> str:
-        """Return an advantage as text."""
+        """Return an advantage as text; NaN: all runs of the claim's method failed."""
+        if math.isnan(advantage):
+            return MISSING
         if self.metric in COSTS:
             return f"× {math.exp(advantage):.2f}"
         return f"{advantage:+.{self.measure.column.decimals}f}"
@@ -205,7 +208,7 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         runs = runs.loc[[place.outdoor is (claim.scenes == "outdoor") for place in runs["place"]]]
     ours, others = claim.sides
     shared = ("place", "resolution", "length", "data", *(("machine",) if claim.metric in COSTS else ()))
-    best: dict[Place, dict[str, Any]] = {}
+    best: dict[tuple[str, ...], dict[str, Any]] = {}
     for values, alike in grouped(runs, *shared) if len(runs) else ():
         found = dict(zip(shared, values, strict=True))
         size, length = found["resolution"], found["length"]
@@ -213,13 +216,20 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         refuse_mixture(alike, run_set.request, where, ("protocol",))
         if row := _beside_best(claim, one_setting(ours.select(alike), where), others.select(alike)):
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
-            row |= {"scene": found["place"].label, "seen": found["place"].seen, "size": size, "length": length}
+            row |= {
+                "place": found["place"],
+                "scene": found["place"].label,
+                "seen": found["place"].seen,
+                "size": size,
+                "length": length,
+            }
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)
             row["failed"] = failures(ours.select(runs.loc[runs["place"] == found["place"]]))
-            rank = itemgetter("tested", "width", "iterations")
-            best[found["place"]] = max(row, best.get(found["place"], row), key=rank)
-    rows = DataFrame([best[place] for place in sorted(best, key=lambda place: place.rank)])
+            rank, of = itemgetter("tested", "width", "iterations"), row["place"]
+            scene = (of.dataset, of.scene.replace(OTHER_PATH, ""), of.seen if of.dataset != published.BUILT_IN else "")
+            best[scene] = max(row, best.get(scene, row), key=rank)
+    rows = DataFrame(sorted(best.values(), key=lambda row: row["place"].rank))
     if claim.source == OURS and len(rows) and (never := rows["tested"] & (rows["seen"] == NEVER_SEEN)).any():
         rows["tested"] = never
     return rows
@@ -232,7 +242,7 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, 
     for setting in settings(others.drop(index=ours.index, errors="ignore")) if len(others) else ():
         if len(theirs := _numbers(claim, setting.runs)):
             rivals[setting.title] = theirs
-    if not rivals or not len(first):
+    if not rivals or (not len(first) and ours["ok"].all()):
         return None
     advantages = {title: claim.advantage(first.mean(), of.mean(), higher) for title, of in rivals.items()}
     rival, advantage = min(advantages.items(), key=itemgetter(1))

@@ -7,15 +7,17 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, by_conditions
+from padgs.reports.measures import PROTOCOL_METRICS
 from padgs.reports.methods import name, title
 from padgs.reports.selection import Mixture, Request
 from padgs.reports.table import UNRANKED
 from padgs.results import file_name
 
-# Columns of the frame; "protocol" means its rules.
+# Columns of the frame; "protocol" means the rules of all protocols, since tables show numbers of several.
 OF_A_DATA_SET = ("protocol", "resolution", "length", "learning_rates")  # scenes may differ, rules may not
 CONDITIONS = (*OF_A_DATA_SET, "data")
 OF_TIMES = (*CONDITIONS, "machine")
+RULES = tuple(f"{protocol} rules" for protocol in PROTOCOL_METRICS)
 OF_PARTS = tuple(what for what in OF_TIMES if what != "learning_rates")  # an ablation may change the rates
 OF_A_SWEEP = ("protocol", "machine")  # all else shows as a changed key
 OF_A_POINT = ("data",)  # the folder of the data is no part of a setting
@@ -49,13 +51,14 @@ class Reason:
 
 def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: Iterable[str] = CONDITIONS) -> None:
     """Raise Mixture if runs of one block differ in a condition, unless the request allows it."""
-    for what in () if request.mix else conditions:
-        values = _values(runs, what, request.protocol).drop_duplicates()
+    shared = (of for what in conditions for of in (RULES if what == "protocol" else (what,)))
+    for what in () if request.mix else shared:
+        values = _values(runs, what).drop_duplicates()
         if len(values) > 1:
             named = zip(values, runs["run"][values.index], strict=True)
             difference = f"{where}: results differ in {what} ({'; '.join(f'{value} in {run}' for value, run in named)})"
             advice = "choose with --where, or compare them anyway with --mix"
-            raise Mixture(difference, advice, runs, [_column(what, request.protocol)])
+            raise Mixture(difference, advice, runs, [what])
 
 
 def sheets(
@@ -99,7 +102,7 @@ def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
 def _sentence(runs: DataFrame, protocols: Iterable[str]) -> str:
     if runs.empty:
         return "not run."
-    columns = [_values(runs, "protocol", protocol) for protocol in protocols]
+    columns = [_values(runs, f"{protocol} rules") for protocol in protocols]
     columns += [runs[what].dropna() for what in (*OF_A_DATA_SET[1:], "code_version", "hardware")]
     columns.append(runs["seed"].sort_values())
     words = (" / ".join(map(str, values.unique())) or "none" for values in columns)
@@ -110,14 +113,9 @@ def _sentence(runs: DataFrame, protocols: Iterable[str]) -> str:
     return f"protocol {'; '.join(rules)}, {made}"
 
 
-def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:
+def _values(runs: DataFrame, what: str) -> pd.Series:
     """Return a condition of each run that has it; a run without scores under a protocol contradicts no rule."""
-    column = _column(what, protocol)
-    return runs[column].dropna() if column in runs else pd.Series(dtype=object)
-
-
-def _column(what: str, protocol: str) -> str:
-    return f"{protocol} rules" if what == "protocol" else what
+    return runs[what].dropna() if what in runs else pd.Series(dtype=object)
 
 
 def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]:

@@ -147,6 +147,9 @@ def stressed_methods(run_set: RunSet) -> dict[str, list[StressedMethod]]:
     for title, own in by_conditions(runs, "resolution").items():
         refuse_mixture(own, run_set.request, title, SHARED)
         made = [one for preset in methods.ordered(own["preset"]) if (one := _stressed_method(own, preset, title))]
+        gone = own[CONDITION].notna() & ~own["preset"].isin([one.preset for one in made])
+        for preset in own.loc[gone, "preset"].unique():
+            run_set.warnings.append(f"{title}: {methods.title(preset)} is left out, for it has no run without stress")
         if made:
             every = {stress for one in made for stress in one.runs if stress[0] not in NOT_SCORED}
             made = [replace(one, missing=every - one.runs.keys()) for one in made]

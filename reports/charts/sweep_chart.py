@@ -1,7 +1,9 @@
 """Charts of sweeps: each quantity over the key that was swept, a curve per scene and preset, bars over seeds."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pandas import DataFrame
@@ -33,6 +35,12 @@ class Curve:
     fixed: str  # values of other swept keys
     key: str  # dotted key along x; empty if settings only have names
     points: tuple[tuple[Any, list[Cell]], ...]  # x, a cell for each measure of the sweep
+
+    @property
+    def named(self) -> Curve:
+        """The curve with the name of its key beside each value."""
+        points = ((f"{self.key.rpartition('.')[2]} {x}".strip(), cells) for x, cells in self.points)
+        return replace(self, points=tuple(points))
 
     @property
     def title(self) -> str:
@@ -106,6 +114,8 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
 @styled
 def chart(sweep: Sweep) -> Chart:
     """Return a panel for each quantity; a dotted line marks the paper's value."""
+    if not sweep.key:  # several keys share an axis of texts
+        sweep = replace(sweep, curves=tuple(curve.named for curve in sweep.curves))
     made, axes = figure(min(COLUMNS, len(sweep.measures)), -(-len(sweep.measures) // COLUMNS), 3.6)
     for index, (panel, measure) in enumerate(zip(axes.flat, sweep.measures, strict=False)):
         _set_axes(panel, sweep, index, measure)

@@ -12,7 +12,7 @@ from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mi
 from padgs.reports.frame import by_place, without_data
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
-from padgs.reports.selection import Request, RunSet, settings
+from padgs.reports.selection import Request, RunSet, one_setting, settings
 from padgs.reports.significance import failures, over_scenes
 from padgs.reports.table import Cell
 from padgs.results import file_name
@@ -152,6 +152,8 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
     every = settings(pd.concat(group.values()))
     for setting in every:
         refuse_mixture(setting.runs, request, f"{name}, {setting.title}", OF_A_MEAN)
+        for place, own in by_place(setting.runs).items():
+            one_setting(own, f"{place.title}, {setting.title}")
     found = [setting for setting in every if setting.runs["ok"].any()]
     failed = [f"{one.title} ({failures(one.runs).upper()})" for one in every if not one.runs["ok"].any()]
     finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]

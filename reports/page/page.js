@@ -35,7 +35,8 @@ for (const link of document.querySelectorAll("a[download]")) {
       for (const row of table.tBodies[0].rows) {
         for (const cell of [...row.cells].slice(1)) {
           const value = cell.dataset.sort === "-1e99" ? "" : cell.dataset.sort;
-          const column = columns[cell.cellIndex].textContent;
+          const heading = columns[cell.cellIndex];
+          const column = `${heading.dataset.group} ${heading.textContent}`;
           lines.push([table.caption.textContent, row.cells[0].textContent, column, value, cell.textContent]);
         }
       }

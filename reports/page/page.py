@@ -88,7 +88,7 @@ def album(run_set: RunSet) -> Album:
     """Return a few views of each scene, of all settings of methods and rows of ablations; one seed is enough."""
     runs, parts = run_set.chosen("table1"), run_set.chosen("table3")
     own = pd.concat([runs, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
-    own = own.loc[own["renders"].map(render_names).map(len) > 0]
+    own = own.loc[own["ok"] & (own["renders"].map(render_names).map(len) > 0)]
     groups = {place: sorted(settings(runs), key=_mean_psnr, reverse=True) for place, runs in by_place(own).items()}
     groups = dict(sorted(groups.items(), key=lambda group: bool(group[0].dataset)))  # the user's captures first
     count = min(MAX_VIEWS, max(1, MAX_FILES // max(1, sum(map(len, groups.values())))))

@@ -21,6 +21,7 @@ from padgs.reports.claims import (
     load,
 )
 from padgs.reports.methods import title
+from padgs.reports.selection import Mixture
 
 SCENES = ("synthetic-room", "synthetic-cave", "synthetic-den", "synthetic-hut", "synthetic-loft", "synthetic-shed")
 BETTER, WORSE = ([1, 1.1], [2, 2.1], [1.5, 1.4]), ([-1, -1.1], [-2, -2.1], [-1.5, -1.4])
@@ -128,6 +129,39 @@ def test_a_claim_does_not_hold_where_runs_of_its_method_failed():
         assert found.verdict == UNDECIDED and list(found.scenes["failed"]) == ["", "", "nan"]
         of_rivals = [replace(run, preset="omnigs", run=f"{run.run}o") for run in failed]
         assert verdict([*made, *of_rivals]) == HOLDS, "failures of rivals do not make it wrong"
+
+
+def test_a_scene_where_all_runs_of_its_method_failed_is_listed():
+    lost = against([0, 0], seeds=2, dataset="", fingerprint="z")
+    lost = [replace(one, scene="z", status="oom" if one.preset == "padgs" else "ok", run=f"z{one.run}") for one in lost]
+    lost = [replace(one, scores={}) if one.status == "oom" else one for one in lost]
+    made = [*against(*BETTER), *lost]
+    found = evidence(made)
+    assert (found.verdict, len(found.tested), list(found.scenes["failed"])) == (UNDECIDED, 3, ["oom", "", "", ""])
+    assert "nan" not in str(findings(run_set(made)).text).lower()
+
+
+def test_a_scene_counts_once_whatever_the_rules_and_the_positions():
+    def cropped(one):
+        paper = replace(one.scores["paper"], protocol=one.scores["paper"].protocol | {"bottom_crop": 0.1})
+        return replace(one, scores=one.scores | {"paper": paper}, run=f"{one.run}-cropped", iterations=3000)
+
+    made = against(*BETTER)
+    assert len(evidence([*made, *map(cropped, made)]).tested) == 3
+    path = [replace(one, scene=f"{one.scene}-other-path", run=f"{one.run}-path") for one in made]
+    assert len(evidence([*made, *path]).tested) == 3
+
+
+@pytest.mark.parametrize(("protocol", "number"), [("paper", "paper/psnr"), ("sphere", "sphere/ws_psnr")])
+def test_sides_under_different_rules_are_not_compared(protocol, number):
+    made = against(*BETTER)
+    for one in made:
+        if one.preset == "padgs":
+            one.scores[protocol] = replace(
+                one.scores[protocol], protocol=one.scores[protocol].protocol | {"bottom_crop": 0.25}
+            )
+    with pytest.raises(Mixture, match=f"differ in {protocol} rules"):
+        evidence(made, metric=number)
 
 
 def test_the_best_rival_counts_and_a_required_one_must_be_there():

@@ -150,6 +150,10 @@ def test_columns_are_chosen_by_name():
     assert [column.title for column in table.columns] == ["PSNR", "paper", "Δ", "ms per frame"]
     with pytest.raises(ReportError, match="unknown metric 'pnsr'; known under protocol paper: psnr"):
         table1(run_set(data_set("roam360"), metrics=("pnsr",)))
+    for block in table1(run_set(data_set("roam360"), metrics=("frame_ms", "psnr"))).blocks:
+        if block.across:
+            kinds = {row.title.partition(", ")[2] for row in block.rows}
+            assert kinds == ({"", "paper", "Δ"} if "PSNR" in block.title else {""}), "no decibels among milliseconds"
 
 
 def test_the_average_over_all_scenes():
@@ -311,7 +315,7 @@ def test_seeds_are_averaged_with_their_deviation():
         (replace(FOUR[1], fingerprint="other"), "data"),
         (
             replace(FOUR[1], scores={"paper": Scores({**RULES, "lpips": "alex"}, FOUR[1].scores["paper"].metrics, {})}),
-            "protocol",
+            "paper rules",
         ),
     ],
 )

@@ -113,6 +113,15 @@ def test_a_stopped_run_is_neither_a_seed_nor_a_reference():
     assert stability(run_set([*runs(), *stopped]))[0] == stability(run_set(runs()))[0]
 
 
+def test_a_method_whose_run_without_stress_failed_is_named():
+    lost = [run("spags", 0.0, status="diverged"), run("spags", 20.0, "pose_noise", 1), run("spags", 20.0, "seam", 1)]
+    of = run_set([*runs(), *lost])
+    stability(of)
+    assert (
+        "synthetic-room" in of.warnings[0] and "SPaGS is left out, for it has no run without stress" in of.warnings[0]
+    )
+
+
 def test_seeds_are_compared_with_their_own_reference():
     _, *others = runs(seed=1)
     table, *_ = stability(run_set([*runs(), run("omnigs", 17.0, seed=1), *others]))

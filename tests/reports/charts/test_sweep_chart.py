@@ -41,6 +41,19 @@ def test_settings_without_numeric_keys_have_names():
     assert "projection tangent" in chart(sweep).svg
 
 
+def test_keys_that_share_an_axis_are_named_along_it():
+    made = [
+        small(25 + i, 1 + i, experiments=("mine",), config={"method": {"tau": t}}) for i, t in enumerate((0.0, 0.9))
+    ]
+    made += [
+        small(25 + i, 3 + i, method="omnigs", experiments=("mine",), config={"method": {"offsets": n}})
+        for i, n in enumerate((5, 10))
+    ]
+    (sweep,) = sweeps(run_set(made))
+    drawn = chart(sweep).svg
+    assert sweep.key == "" and all(f">{words}<" in drawn for words in ("tau 0.0", "tau 0.9", "offsets 5", "offsets 10"))
+
+
 def test_a_failed_point_shows_its_status():
     runs = [replace(r, status="nan", scores={}) if r.config["method"]["tau"] == 1.0 else r for r in swept("tau")]
     (sweep,) = sweeps(run_set(runs, metrics=("ssim",)))
@@ -68,7 +81,7 @@ def test_an_experiment_is_chosen_and_those_of_charts_are_sweeps_only_if_requeste
 def test_protocols_are_not_mixed_along_a_curve_nor_data_in_a_point():
     first, *others = swept("tau")
     other = replace(first, scores={"paper": replace(first.scores["paper"], protocol={"lpips": "alex"})})
-    with pytest.raises(ReportError, match="tau@cpu, .*differ in protocol"):
+    with pytest.raises(ReportError, match="tau@cpu, .*differ in paper rules"):
         sweeps(run_set([other, *others]))
     with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
         sweeps(run_set([first, replace(first, fingerprint="other", run="other"), *others]))

@@ -199,8 +199,14 @@ def test_lengths_machines_and_settings_of_the_shown_protocol_are_not_mixed():
     with pytest.raises(ReportError, match="differ in machine"):
         trade_offs(run_set([replace(first, machine={"gpu": "H200"}), *others]))
     sphere = replace(first.scores["sphere"], protocol=first.scores["sphere"].protocol | {"bottom_crop": 0.1})
-    with pytest.raises(ReportError, match="differ in protocol"):
+    with pytest.raises(ReportError, match="differ in sphere rules"):
         trade_offs(run_set([replace(first, scores=first.scores | {"sphere": sphere}), *others]))
+
+
+def test_of_two_runs_with_one_setting_and_seed_neither_is_chosen():
+    first, *others = compared()
+    with pytest.raises(ReportError, match="again are the same setting; delete one of them"):
+        trade_offs(run_set([first, *others, replace(first, run="again", scores=small(9.0).scores)]))
 
 
 def test_scenes_of_two_data_sets_may_have_one_name():

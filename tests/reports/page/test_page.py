@@ -1,4 +1,5 @@
 import csv
+import math
 import re
 import time
 from dataclasses import replace
@@ -82,6 +83,19 @@ def test_the_users_captures_and_the_best_method_come_first(tmp_path):
     assert first["title"].startswith("z-flat") and second["title"].startswith("synthetic-room")
     psnr = [float(method["title"].split()[-2]) for method in first["views"][0]["methods"]]
     assert psnr == sorted(psnr, reverse=True) and len(psnr) == 6
+
+
+def test_pictures_are_of_runs_that_did_not_fail(tmp_path):
+    first = small(20.0, seed=0, status="degenerate")
+    write([first, small(21.0, seed=1)], tmp_path, renders=True)
+    (scene,) = page.album(RunSet(frame(store.read(tmp_path)[0]))).scenes
+    assert [method["title"] for method in scene["views"][0]["methods"]] == ["PaD-GS, PSNR 21.00 dB"]
+
+
+def test_an_exact_render_is_sorted_as_the_best_and_columns_are_named_with_their_group():
+    html = page.html(run_set([small(math.inf), *data_set("roam360")]))
+    assert 'data-sort="999999999.000000000"' in html and 'data-sort="inf"' not in html
+    assert 'data-group="PSNR">paper ↑<' in html
 
 
 def test_the_number_of_files_is_bounded(runs, monkeypatch):
