@@ -27,7 +27,7 @@ class OP43DGSOptions(SplatOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "at least 1 byte, or none", lambda cap: cap is None or cap >= 1, "memory_cap")
+        check(self, "at least 1 byte, or null", lambda cap: cap is None or cap >= 1, "memory_cap")
 
 
 class OP43DGSModel(SplatModel):

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from padgs.baselines.omnigs import OmniGSMethod
 from padgs.checks import check
-from padgs.methods.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.method import SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.scene import View
 from padgs.training.model import TrainingRender
@@ -42,7 +43,7 @@ class SCOmniGSModel(SplatModel):
         return replace(drawing, penalty=penalty)
 
 
-class SCOmniGSMethod(SplatMethod):
+class SCOmniGSMethod(OmniGSMethod):
     """SC-OmniGS (Huang et al. 2025): poses and a map of the camera are learned with the Gaussians."""
 
     Options = SCOmniGSOptions

@@ -2,10 +2,9 @@
 
     OMP_NUM_THREADS=1 python docs/growth.py
 
-writes the table in docs/notes/growth.md and the chart docs/growth.png in some minutes on an idle machine; `--quick`
-prints small sizes and writes nothing. Gaussians lie on the walls of a cube, as large as their distance from the next,
-and the panoramas are noise; every size has a process of its own, whose memory is counted above that of the smallest
-size.
+writes the table in docs/notes/growth.md in some minutes on an idle machine; `--quick` prints small sizes and writes
+nothing. Gaussians lie on the walls of a cube, as large as their distance from the next, and the panoramas are noise;
+every size has a process of its own, whose memory is counted above that of the smallest size.
 """
 
 import json
@@ -23,7 +22,6 @@ WIDTH, COUNT, TINY = 1024, 100_000, (64, 1000)
 QUICK = ((10_000, 20_000, 40_000), (256, 512), 256, 10_000)
 WARM_UP, ITERATIONS, VIEWS = 3, 10, 4
 FOLDER = Path(__file__).resolve().parent
-KINDS = {"Gaussians": "Gaussians at {width} × {height}", "pixels": "pixels with {count} Gaussians"}
 
 
 def measure(width: int, count: int) -> tuple[float, int]:
@@ -76,7 +74,7 @@ def exponent(found: list[tuple[int, float, float]], column: int) -> float:
 
 
 def main() -> None:
-    """Measure, print or write the table, and draw the chart."""
+    """Measure, and print or write the table."""
     if "--one" in sys.argv:
         print(json.dumps(measure(*map(int, sys.argv[-2:]))))
         return
@@ -92,25 +90,6 @@ def main() -> None:
     page = FOLDER / "notes" / "growth.md"
     between = re.compile(r"(<!-- growth -->\n).*(<!-- end -->)", re.DOTALL)
     page.write_text(between.sub(lambda m: f"{m[1]}{table}\n{m[2]}", page.read_text()))
-    draw(rows)
-
-
-def draw(rows: dict[str, list[tuple[int, float, float]]]) -> None:
-    """Plot time and memory in logarithmic scales, one panel each."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
-    for panel, column, label in zip(panels, (1, 2), ("CPU ms per iteration", "memory (MB)"), strict=True):
-        for kind, found in rows.items():
-            title = f"{kind}: exponent {exponent(found, column):.2f}"
-            panel.loglog([row[0] for row in found], [row[column] for row in found], "o-", label=title)
-        panel.set(xlabel="number of Gaussians or pixels", ylabel=label)
-        panel.grid(alpha=0.3, which="both")
-        panel.legend()
-    figure.savefig(FOLDER / "growth.png", dpi=110)
 
 
 if __name__ == "__main__":

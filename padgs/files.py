@@ -79,10 +79,9 @@ def write_atomically(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     folder = os.open(path.parent, os.O_RDONLY)
-    try:
+    with suppress(OSError):  # some file systems cannot
         os.fsync(folder)  # the rename itself must survive a power cut
-    finally:
-        os.close(folder)
+    os.close(folder)
 
 
 def read_regular(path: Path) -> bytes:

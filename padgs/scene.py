@@ -17,7 +17,7 @@ from torch import Tensor
 from padgs.geometry.camera import Camera, Panorama
 
 SINGLE_CENTER = 1e-6  # an extent up to so many scene scales is rounding
-FAR = 1000.0  # largest distance of the cameras from the origin, in scene scales; there float32 has steps of 6e-5
+FAR = 10.0  # largest distance of the cameras from the origin, in scene scales; there float32 has steps of 1e-6
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.methods.anchors.method import PaDGSMethodOptions
 from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.multirun.composition import composing, configuration, variant_choices
-from padgs.multirun.overrides import expand, lenient, missing_plugin, quoted
+from padgs.multirun.overrides import expand, lenient, missing_plugin, problem, quoted
 from padgs.render import RenderConfig
 from padgs.reports.conditions import CALIBRATES
 from padgs.runs.config import RunOptions, TrainConfig, method_choices
@@ -138,6 +138,18 @@ def test_a_sweep_of_nothing_is_refused(setting):
         pytest.raises(ValueError, match=f"^{re.escape(setting)} has no value; correct the name"),
     ):
         expand({}, [setting], loader)
+
+
+def test_a_sweep_of_folders_is_refused():
+    with composing() as loader, pytest.raises(ValueError, match="^run.folder=a,b has several values; use one command"):
+        expand({}, ["run.folder=a,b"], loader)
+
+
+@pytest.mark.parametrize("launcher", [[], ["launcher=slurm"], ["launcher=ray"]])
+def test_a_number_of_jobs_that_a_launcher_does_not_read_is_refused(launcher):
+    refusal = problem(["-m", *launcher, "run.jobs=4"])
+    assert "run.jobs=4 is for launcher=local or submitit" in refusal and "array_parallelism" in refusal
+    assert problem(["-m", "launcher=local", "run.jobs=4"]) is None
 
 
 def test_the_tables_of_the_paper_are_all_of_its_scenes_times_all_of_its_methods():

@@ -1,5 +1,7 @@
+import errno
 import os
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from padgs import results
-from padgs.files import DRAFT, atomic_path, draft_of, read_regular
+from padgs.files import DRAFT, atomic_path, draft_of, read_regular, write_atomically
 from padgs.runs import checkpoint
 
 KILLED = """
@@ -70,3 +72,16 @@ def test_pipes_in_place_of_files_of_a_run_are_refused(name: str, tmp_path: Path)
         results.read(tmp_path / "result.json")
     with pytest.raises(checkpoint.CheckpointError, match=r"cannot read .*state.json: (it is no regular|No such) file"):
         checkpoint.load(tmp_path / "checkpoint")
+
+
+def test_a_file_is_written_where_folders_cannot_be_forced_to_the_disk(tmp_path, monkeypatch):
+    force = os.fsync
+
+    def only_files(number):
+        if stat.S_ISDIR(os.fstat(number).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        force(number)
+
+    monkeypatch.setattr(os, "fsync", only_files)
+    write_atomically(tmp_path / "a", b"all")
+    assert (tmp_path / "a").read_bytes() == b"all"

@@ -56,10 +56,11 @@ def views_along(
     """
     scene, trained = run.scene, run.scene.train[0]
     if perspective_shape is None:
-        lens: Camera = Panorama(width or trained.width, (width or trained.width) // 2)
+        width = width or max(4, trained.width // 4 * 4)  # even sides, for videos
+        lens: Camera = Panorama(width, width // 2)
     else:
         height, fov = perspective_shape
-        width = width or trained.width // 2
+        width = width or max(2, trained.width // 4 * 2)
         lens = perspective(width, 2 * round(width * 9 / 32) if height is None else height, fov)
     frames = None if seconds is None else max(2, round(seconds * fps))
     if path in PATHS:
@@ -177,7 +178,8 @@ def _folder(path: Path, description: str) -> Iterator[WriteFrame]:
 def _mp4(path: Path, view: View, fps: float, spherical: bool) -> Iterator[WriteFrame]:
     if view.width % 2 or view.height % 2:
         size = f"{view.width}x{view.height}"
-        raise ValueError(f"frames are {size}; H.264 supports even sides only: choose even sides, or a folder")
+        rule = "H.264 supports even sides only: choose a multiple of 4 for --width, an even --height, or a folder"
+        raise ValueError(f"frames are {size}; {rule}")
     try:
         import av
     except ImportError as error:

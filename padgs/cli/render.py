@@ -15,7 +15,9 @@ def render(
     path: Annotated[str, typer.Option(help="cameras, orbit, dolly, or a JSON of keyframes or nerfstudio")] = "cameras",
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
     fov: Annotated[float | None, typer.Option(help="horizontal degrees of a perspective image; default 90")] = None,
-    width: Annotated[int, typer.Option(help="width in pixels; 0: that of the run, half of it in perspective")] = 0,
+    width: Annotated[
+        int, typer.Option(help="width in pixels; 0: about the run's, half in perspective")
+    ] = 0,
     height: Annotated[int | None, typer.Option(help="height of a perspective image; default 9/16 of the width")] = None,
     seconds: Annotated[float | None, typer.Option(help="length of the video; default 10, or that of the path")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
@@ -26,6 +28,7 @@ def render(
     transform: Transform = "",
 ) -> None:
     """Write a video or PNGs along a camera path: 360-degree, which players recognise, or in perspective."""
+    import os
     from pathlib import Path
 
     from rich.console import Console
@@ -52,7 +55,7 @@ def render(
         shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
         views = views_along(found, path, seconds, fps, width, shape)
         lens = views[0].camera
-        output = Path(to) if to else found.folder / "video.mp4"
+        output = Path(os.path.abspath(to)) if to else found.folder / "video.mp4"
         with name_place(output):
             outputs = write_video(
                 output,

@@ -196,7 +196,7 @@ def _message(error: Exception) -> str:
         return unknown(group, name, error.options or ())
     if isinstance(error, OverrideParseException):
         key, _, value = error.override.lstrip("+").partition("=")
-        rule = "values with spaces or any of ,;:{}[]()'\" need quotes"
+        rule = "values with spaces or other signs than letters, digits and -_./+ need quotes"
         return f"{key}={value} cannot be read: {rule}, e.g. padgs-run '{key}=\"VALUE\"'"
     if several := re.match("Ambiguous value for argument '(?:\\+\\+)?(.*)'\n", str(error)):
         return f"{several[1]} has several values; give -m for one run each"

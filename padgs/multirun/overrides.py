@@ -29,7 +29,7 @@ PLUGINS = {  # choice of conf/launcher -> module of its plugin, extra of pyproje
 MOST_JOBS = 10_000
 # Keys that name files, and their values; values in Hydra's grammar: nothing, null, quotes, dictionaries, calls;
 # one name of a list.
-FILES = re.compile(r"(\+*(?:data\.(?:path|images|points|mask)|run\.folder|init)=)(.*)", re.DOTALL)
+FILES = re.compile(r"(\+*(?:data\.(?:path|images|points|mask|disk_cache)|run\.folder|init)=)(.*)", re.DOTALL)
 GRAMMAR = re.compile(r"|null|(['\"]).*\1|\{.*\}|(choice|glob|shuffle|sort|tag)\(.*\)", re.DOTALL)
 ONE_OF_SEVERAL = re.compile(r"\"[^\"]*\"|'[^']*'|[^,]+")
 
@@ -150,8 +150,9 @@ def problem(arguments: Sequence[str]) -> str | None:
         command = f"padgs-run -m {shlex.join(arguments)}"
         return f"launcher={launcher} launches the jobs of a multirun; for this run: {command}"
     jobs = settings.get("run.jobs", "=1").partition("=")[2]
-    if jobs != "1" and launcher == "none" and "hydra/launcher" not in settings:
-        return f"run.jobs={jobs} requires a launcher that runs several jobs at a time, e.g. launcher=local"
+    if jobs != "1" and launcher in ("none", "slurm", "ray") and "hydra/launcher" not in settings:
+        rule = f"is for launcher=local or submitit, and launcher is {launcher}"
+        return f"run.jobs={jobs} {rule}; on Slurm, hydra.launcher.array_parallelism is the number of jobs at a time"
     return None
 
 
@@ -185,6 +186,8 @@ def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLo
         first = list(itertools.islice(values, MOST_JOBS + 1))  # range(1,1e9) would take all memory
         if not first:
             raise ValueError(f"{override.input_line} has no value; correct the name or the range")
+        if key.lstrip("+") == "run.folder" and len(first) > 1:
+            raise ValueError(f"{override.input_line} has several values; use one command for each folder")
         texts = [override.get_value_element_as_str() if value is None else value for value in first]
         choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in texts]
     if math.prod(map(len, choices.values())) > MOST_JOBS:

@@ -136,7 +136,8 @@ class Multirun:
             gives_up = self._in_process or idle >= IDLE_LAUNCHES
             lost = {index for index in left if gives_up or attempts[index] >= ATTEMPTS}
             for index in lost:
-                status = Status.REFUSED if self._in_process else Status.KILLED
+                is_refused = self._in_process or (error and self.states[index].status == Status.WAITING)  # none began
+                status = Status.REFUSED if is_refused else Status.KILLED
                 reason = f"a job ended without a status: {error or f'check the free space in {self.runs}'}"
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]

@@ -85,7 +85,7 @@ def run(
         result = _completed(config, scene, store, words)
         if result is None:
             method, progress = _prepared(config, scene, store, words)
-            saved_at, saved = time.monotonic(), progress
+            saved_at, saved, interrupted = time.monotonic(), progress, False
             with _Outcome(initial_result(config, scene, store.path.name), scene) as outcome:
                 with (
                     Interrupt(callback.stop_requested) as interrupt,
@@ -96,7 +96,8 @@ def run(
                         progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                         probed = _log(config, scene, store, record, method)
                         interrupted = interrupt.requested
-                        ending = stop.requested and not (method.ended or config.train.refine)  # a candidate of a search
+                        is_candidate = config.train.hold_out is not None  # of a search for the smallest model
+                        ending = stop.requested and not (method.ended or is_candidate)
                         ending = ending and method.request_stop(STOP_REQUESTED)
                         every = config.run.checkpoint_every
                         due = every is not None and record.iteration % every == 0
@@ -105,11 +106,13 @@ def run(
                             store.save(method, progress)
                             callback.saved(store.path)
                             saved_at, saved = time.monotonic(), progress
-                        if interrupted and record.progress < 1:
-                            raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
+                        if interrupted:
+                            break
                         line.update(record, probed)
                     if saved != progress:
                         store.save(method, progress)
+                    if interrupted or interrupt.requested:
+                        raise Interrupted(f"stopped after iteration {progress.iteration}, the checkpoint is written")
                 outcome.result = replace(outcome.result, **_trained(method, scene, progress))
                 if scene.test:
                     outcome.result = scored(config, scene, store, outcome.result, method)

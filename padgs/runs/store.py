@@ -116,8 +116,8 @@ class RunStore:
         """True if another process holds the lock, or the folder cannot be locked from here."""
         try:
             self._lock.acquire(timeout=0)
-        except OSError:  # a `Timeout`, or a folder that cannot be locked from here
-            return True
+        except OSError as error:  # a `Timeout`, or a folder that cannot be locked from here
+            return isinstance(error, Timeout) or (self.path / OWNER).exists()
         self._lock.release()
         return False
 

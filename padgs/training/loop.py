@@ -67,7 +67,7 @@ class Trainer:
         self.durations: list[float] = []
         self.start = next(iter(model.counts().values()))
         self._model, self._budget, self._options, self._stage = model, budget, options, stage
-        self._views_each = views_each
+        self._views_each, self._seed = views_each, seed
         self.corrections = Corrections(scene, options)
         groups = model.groups()
         self._device = groups[0].parameters[0].device
@@ -144,7 +144,8 @@ class Trainer:
             with stage("loss"):
                 target = self.corrections.undistorted(view, target)
                 if options.random_background:
-                    image = target.with_background(image, rendered.rendering.transmittance, background(iteration))
+                    color = background(iteration, self._seed)
+                    image = target.with_background(image, rendered.rendering.transmittance, color)
                 loss = target.loss(image, rendered.rendering.depth, options, self._unit)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
@@ -166,7 +167,7 @@ class Trainer:
         optimizer.check(iteration)
         length = self._budget.iterations
         # Skipped steps count as done, so that learning rates do not rise when a run is stopped.
-        iterations = round(length * iteration / (step - self.skipped))
+        iterations = round(length * iteration / max(1, step - self.skipped))
         pace = Pace.of(self._options.learning_rates, iterations, length)
         with self._stage("optimizer"):
             optimizer.step(step, pace)
@@ -199,6 +200,7 @@ class Trainer:
             getattr(self, f"_{name}").state = copy.deepcopy(state.values[name])
 
 
-def background(iteration: int) -> list[float]:
+def background(iteration: int, seed: int) -> list[float]:
     """Return the random colour of an iteration; without a state, so that a resumed run goes on alike."""
-    return torch.rand(3, generator=torch.Generator().manual_seed(iteration)).tolist()
+    number = (iteration + 1_000_003 * seed) % 2**32  # the generator ignores higher bits
+    return torch.rand(3, generator=torch.Generator().manual_seed(number)).tolist()

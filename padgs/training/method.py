@@ -92,23 +92,24 @@ class Method(ABC):
         if budget.seconds is not None:
             known = None if self._loaded_state is None else self._loaded_state.values["schedule"]
             budget = replace(budget, iterations=known or self._schedule_length(scene, budget, lap))
-        self._model = self._initial_model(scene, budget.iterations)
         if (fold := self.train_options.hold_out) is not None:
             folds = validation_folds(scene.train)
             if fold >= len(folds):
                 raise ValueError(f"train.hold_out is {fold}; the folds of this scene are 0 to {len(folds) - 1}")
+            if self._views_learn and self._warm_start_state is not None:
+                rule = "init has corrections of all views, in their order; set one of both to null"
+                raise ValueError(f"train.hold_out is {fold}, but {rule}")
             scene = replace(scene, train=tuple(v for n, v in enumerate(scene.train) if n not in folds[fold]))
+        self._model = trained = self._initial_model(scene, budget.iterations)
         if self.train_options.refine:
-            refined: Any = Refined(self._model, self.train_options.learning_rates, budget.iterations)
-            self._trainer = Trainer(refined, scene, budget, self.train_options, self.seed, stage=stage)
-        else:
-            self._trainer = self.build_trainer(self._model, scene, budget, stage)
+            trained = Refined(self._model, self.train_options.learning_rates, budget.iterations)
+        self._trainer = self.build_trainer(trained, scene, budget, stage)
         self._trainer.seconds, self._trainer.cpu_seconds = lap.seconds()
         self._trainer.began = self._trainer.spent
         if self._warm_start_state is not None:
             stored, own = self._warm_start_state.under(VIEWS), self._trainer.corrections.state_dict()
-            if all(tensor.shape == stored[name].shape for name, tensor in own.items() if name in stored):
-                self._trainer.corrections.load_state_dict(stored, strict=False)
+            fitting = {name: of for name, of in stored.items() if name in own and of.shape == own[name].shape}
+            self._trainer.corrections.load_state_dict(fitting, strict=False)
         if self._loaded_state is not None:
             self._trainer.load_state(self._loaded_state)
             self._loaded_state = None
@@ -151,6 +152,8 @@ class Method(ABC):
         if (world := self.world) is not None:
             view = view.at(world.pose(view.cam_from_world))
         rendering = self.model.render(view)
+        if world is not None:
+            rendering = replace(rendering, depth=rendering.depth / world.scale)
         if self._camera is None or not isinstance(view.camera, Panorama):
             return rendering
         return self._camera.photographed(rendering)

@@ -30,9 +30,9 @@ class Budget:
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "iterations")
-        rule = "at least 1 Gaussian, auto for as many as needed, or none for no target"
+        rule = "at least 1 Gaussian, auto for as many as needed, or null for no target"
         check(self, rule, lambda n: n in (None, AUTO) or isinstance(n, int) and n >= 1, "gaussians")
-        check(self, "> 0 and finite, or none", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
+        check(self, "> 0 and finite, or null", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
         check_known(self, clock=CLOCKS, stop=STOPS)
 
     def __str__(self) -> str:
@@ -48,7 +48,7 @@ class Budget:
     def next_step(self, last: int, spent: float, step_seconds: float, *, skipped: int = 0, began: float = 0.0) -> int:
         """Return the schedule step of the next iteration; `iterations` for the last one.
 
-        `last` is the step of the iteration before, 0 for none; `spent` the seconds of training so far, with building
+        `last` is the step of the iteration before, 0 for null; `spent` the seconds of training so far, with building
         the initial model; `step_seconds` the expected duration of the next iteration; `skipped` the number of steps
         that took no time; `began` the seconds before the first step, after which the schedule fills the rest.
 
@@ -109,4 +109,4 @@ class TrainOptions:
         else:
             check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "learning_rates")
         check(self, "at least 1", lambda every: every >= 1, "check_every")
-        check(self, "the number of a fold, from 0, or none", lambda fold: fold is None or fold >= 0, "hold_out")
+        check(self, "the number of a fold, from 0, or null", lambda fold: fold is None or fold >= 0, "hold_out")

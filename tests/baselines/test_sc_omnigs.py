@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from support.rates import assert_log_linear
@@ -31,6 +33,27 @@ def test_first_step_is_bit_equal_to_omnigs():
         )
     ]
     assert losses[0] == losses[1]
+
+
+def test_learning_rates_follow_the_law_of_omnigs():
+    assert SCOmniGSMethod(train=TrainOptions(learning_rates="run")).train_options.learning_rates == "run_linear"
+
+
+def test_depth_is_in_units_of_the_given_world_whatever_the_size_of_the_model():
+    method, view = started(SCOmniGSMethod(render=TORCH)), tiny_scene().test[0]
+    poses, splats, rendered = method._poses, method.model.splats, []
+    for size in (1, 2):
+        with torch.no_grad():
+            splats.means *= size
+            splats.log_scales += math.log(size)
+            for number, (quaternion, shift) in enumerate(zip(poses.quaternions, poses.shifts, strict=True)):
+                quaternion.copy_(torch.tensor([1.0, 0, 0, 0]))
+                shift.copy_((size - 1) * poses.given[number, :3, 3] / poses.scale)
+        assert method.world.scale == pytest.approx(size)
+        rendered.append(method.render(view))
+    torch.testing.assert_close(rendered[1].image, rendered[0].image, atol=1e-3, rtol=0)
+    torch.testing.assert_close(rendered[1].depth, rendered[0].depth, atol=1e-2, rtol=1e-3)
+    assert rendered[0].depth.max() > 1
 
 
 @pytest.mark.parametrize(("name", "value"), [("anisotropy_ratio", 0.5), ("anisotropy_weight", -1.0)])

@@ -180,7 +180,8 @@ class NeverStarts(Start):
 
 def test_a_launcher_that_starts_nothing_is_given_up(tmp_path, capsys):
     start = NeverStarts(tmp_path, 1, ELSEWHERE)
-    assert start.counts() == {"killed": 3} and len(start.launched) == 3 * sweep.IDLE_LAUNCHES
+    assert start.counts() == {"refused": 3} and len(start.launched) == 3 * sweep.IDLE_LAUNCHES
+    assert not start.folder.exists(), "no job began, so there is no output"
     assert capsys.readouterr().err.count("there is no such partition") == 1
 
 

@@ -49,3 +49,11 @@ def test_the_lock_of_a_dead_process_is_free(holder, tmp_path):
         raise ZeroDivisionError
     with RunStore(tmp_path):
         assert (tmp_path / LOCK).exists()
+
+
+def test_a_folder_that_cannot_be_locked_is_busy_only_if_it_has_an_owner(tmp_path, monkeypatch):
+    store = RunStore(tmp_path)
+    monkeypatch.setattr(store._lock, "acquire", lambda **_: (_ for _ in ()).throw(PermissionError(13, "read-only")))
+    assert not store.is_busy
+    (tmp_path / OWNER).write_text("{}")
+    assert store.is_busy

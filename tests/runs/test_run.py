@@ -216,6 +216,16 @@ def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config
     same_checkpoint(config, replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
 
 
+def test_ctrl_c_in_the_last_iteration_scores_at_the_next_start(config, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_at(ITERATIONS - 1, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(Interrupted, match=f"stopped after iteration {ITERATIONS}, the checkpoint is written"):
+            run(config)
+    assert folder_of(config).result() is None
+    result, _ = run(config)
+    assert result.status == "ok" and result.iterations_done == ITERATIONS
+
+
 def same_checkpoint(one, other) -> None:
     mine, theirs = (checkpoint.load(folder_of(config).checkpoint) for config in (one, other))
     assert mine.tensors.keys() == theirs.tensors.keys()

@@ -55,9 +55,9 @@ class RunRenderer:
         return f"{text}; cannot follow: {self._failure}" if self._failure else text
 
     def stop(self) -> None:
-        """Request that a run in training stops and is scored; does nothing to a finished run."""
+        """Request that a run in training stops and is scored; does nothing to one that nobody trains."""
         files = self.run.files
-        if files.result() is None:
+        if files.is_busy and files.result() is None:
             files.stop.touch()
 
     def update(self) -> bool:

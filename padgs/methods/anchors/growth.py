@@ -52,7 +52,7 @@ class GrowthOptions:
         check(self, "an iteration, at least 0", lambda iteration: iteration >= 0, *times)
         check(self, ">= 0 and finite", lambda value: 0 <= value < math.inf, "gradient_threshold", "min_opacity")
         check(self, "a share in [0, 1]", lambda share: 0 <= share <= 1, "eligible_share", "prune_share")
-        check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_anchors")
+        check(self, "at least 1, or null for no limit", lambda most: most is None or most >= 1, "max_anchors")
 
     def for_run(self, iterations: int) -> GrowthOptions:
         """Return the options for another length, windows as shares of it; intervals are `MIN_GROW_EVERY` at least."""

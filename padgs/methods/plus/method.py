@@ -137,5 +137,6 @@ class PlusMethod(SplatMethod):
         return self.model.has_smoothing_filter
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
-        share = self.options.coarse_share if len(scene.train) > 1 else 0.0  # a rehearsal has one view, of usual size
+        # A rehearsal has one view, of usual size, and refinement begins with a fine model.
+        share = 0.0 if len(scene.train) == 1 or self.train_options.refine else self.options.coarse_share
         return Trainer(model, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)

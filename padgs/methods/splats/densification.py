@@ -67,7 +67,7 @@ class DensificationOptions:
         check_known(self, positional_gradient=POSITIONAL_GRADIENTS, split=SPLITS)
         check(self, "an opacity > 0", lambda opacity: 0 < opacity <= 1, "reset_opacity")
         check(self, "an opacity below 1", lambda opacity: 0 <= opacity < 1, "opacity_decay", "min_opacity")
-        check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_gaussians")
+        check(self, "at least 1, or null for no limit", lambda most: most is None or most >= 1, "max_gaussians")
 
     def for_run(self, iterations: int) -> DensificationOptions:
         """Return the options for another length, windows as shares of it; intervals have lower limits."""

@@ -62,11 +62,11 @@ class SplatOptions(DensificationOptions, ExtentOptions):
         factors = ("initial_scale", "means_rate_factor", "means_least_pace")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, *factors)
         check_known(self, length_unit=LENGTH_UNITS)
-        check(self, "> 0 and finite, or none for no pruning", lambda p: p is None or 0 < p < math.inf, "prune_psnr")
+        check(self, "> 0 and finite, or null for no pruning", lambda p: p is None or 0 < p < math.inf, "prune_psnr")
         off = "at least 0, which switches it off"
         check(self, off, lambda value: 0 <= value < math.inf, "sky_per_point", "depth_init_per_pixel")
         limits = ("initial_per_pixel", "limit_per_pixel")
-        check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, *limits)
+        check(self, "> 0, or null for no limit", lambda share: share is None or share > 0, *limits)
 
 
 def lowest_limit(*limits: int | None) -> int | None:
@@ -110,7 +110,7 @@ class SplatMethod(Method):
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
         options = self.options
         shares = (options.initial_per_pixel, options.limit_per_pixel, options.depth_init_per_pixel or None)
-        pixels = room_count(scene) * solid_angle_pixels(scene.train[0]) if any(shares) else 0.0
+        pixels = room_count(scene) * max(map(solid_angle_pixels, scene.train)) if any(shares) else 0.0
         start, limit, filled = (None if share is None else max(1, round(share * pixels)) for share in shares)
         target = self._target(iterations)
         limit = lowest_limit(options.max_gaussians, limit if target is None else target)

@@ -73,6 +73,15 @@ def test_a_finished_run_is_not_followed(tmp_path_factory):
     assert not renderer.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
 
 
+def test_only_a_run_in_training_is_asked_to_stop(folder):
+    renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
+    renderer.stop()
+    assert not renderer.run.files.stop.exists(), "the next start would end at once"
+    with RunStore(folder):
+        renderer.stop()
+    assert renderer.run.files.stop.exists()
+
+
 def test_the_end_of_training_is_detected(folder, tmp_path_factory):
     renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
     shutil.copy(tiny_run(tmp_path_factory) / results.FILE_NAME, folder)

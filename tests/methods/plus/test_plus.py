@@ -30,6 +30,7 @@ from padgs.training.health import Failure
 from padgs.training.loop import Record
 from padgs.training.model import MODEL, State
 from padgs.training.options import Budget, TrainOptions
+from padgs.training.targets import halved
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, initial_per_pixel=None, limit_per_pixel=None, depth_init_per_pixel=0.0)
 
@@ -351,3 +352,11 @@ def test_random_backgrounds_make_all_opaque_but_a_void(darkest):
         list(method.fit(replace(tiny_scene(), train=tuple(lit)), Budget(400)))
         clear.append(method.render(lit[0]).transmittance.mean().item())
     assert clear[1] < 0.2 * clear[0] if darkest else clear[1] > 0.1, clear
+
+
+def test_panoramas_of_several_sizes_start_with_one_number_in_any_order():
+    first, *others = tiny_scene().train
+    views = (halved(first), *others)
+    models = [PlusMethod().build_model(replace(tiny_scene(), train=of), 100) for of in (views, views[::-1])]
+    small, large = sorted(model.counts()["gaussians"] for model in models)
+    assert large < 1.1 * small
