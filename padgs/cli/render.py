@@ -15,9 +15,7 @@ def render(
     path: Annotated[str, typer.Option(help="cameras, orbit, dolly, or a JSON of keyframes or nerfstudio")] = "cameras",
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
     fov: Annotated[float | None, typer.Option(help="horizontal degrees of a perspective image; default 90")] = None,
-    width: Annotated[
-        int, typer.Option(help="width in pixels; 0: about the run's, half in perspective")
-    ] = 0,
+    width: Annotated[int, typer.Option(help="width in pixels; 0: about the run's, half in perspective")] = 0,
     height: Annotated[int | None, typer.Option(help="height of a perspective image; default 9/16 of the width")] = None,
     seconds: Annotated[float | None, typer.Option(help="length of the video; default 10, or that of the path")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
