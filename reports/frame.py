@@ -24,12 +24,13 @@ from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STAT
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
-# Options that results of before they existed do not name, and what those runs did.
+# Options that results of before they existed, or since they ended (hold_out), do not name, and what those runs did.
 BEFORE = {"method.length_unit": "extent", "method.means_least_pace": 1.0, "train.random_background": False}
+BEFORE |= {"train.hold_out": None}
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
-LINEAR, LINEAR_ITERATIONS = ("omnigs", "odgs", "op43dgs"), 3000  # methods with a law of their own for learning rates
+LINEAR, LINEAR_ITERATIONS = ("omnigs", "odgs", "op43dgs", "sc_omnigs"), 3000  # methods with a law of their own for learning rates
 LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.targets`, without torch
 
 
@@ -236,10 +237,10 @@ def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:
         numbers = [step[name] for name in ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr")]
         if not all(0 < float(number) < math.inf for number in numbers[:3]):
             raise ValueError(f"a step of `smallest` has {numbers[:3]} rows, Gaussians and bytes")
-        [float(number) for number in (*numbers, *(step[name] or 0 for name in ("test_ws_psnr", "lpips")))]
+        [float(number) for number in (*numbers, step["lpips"] or 0)]
     if "steps" in found:
-        [found["steps"][found["minimal"][f"{loss:g}"]] for loss in SMALLEST_LOSSES]
-        [float(found[name] or 0) for name in ("rows", "cpu_seconds", "test_ws_psnr")]
+        [found["steps"][found[of][f"{loss:g}"]] for loss in SMALLEST_LOSSES for of in ("minimal", "possible")]
+        [float(found[name] or 0) for name in ("rows", "cpu_seconds", "ws_psnr")]
         found["steps"][found["knee"] or 0]
     return found
 

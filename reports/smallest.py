@@ -28,11 +28,11 @@ IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic
 NOTES = (
     "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
-    "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
-    "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the test views, "
-    "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
+    "keeps all Gaussians, on the test views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
+    "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the whole model, "
+    "less what was lost against the control. Not searched: offsets per anchor, features.",
     "At least: the smallest model that is not known to lose more, with 95 % confidence; the interval of the minimal "
-    "count begins there. By test views: the smallest model that loses no more on the test views.",
+    "count begins there.",
     "Knee: the largest model below which a halving costs more than 0.1 dB.",
 )
 
@@ -62,14 +62,11 @@ class Curve:
         return [np.nan if step[name] is None else step[name] for step in self.steps]
 
     def quality_of(self, step: Mapping[str, Any]) -> float:
-        """Return WS-PSNR (dB) of the searched run less the loss of a candidate against the control, on test views.
+        """Return WS-PSNR (dB) of the searched run less the loss of a candidate against the control.
 
-        Without test views on validation views. The control was refined likewise, and kept all Gaussians.
+        The control was refined likewise, and kept all Gaussians.
         """
-        control = self.found["steps"][0]
-        if step["test_ws_psnr"] is None:
-            return control["ws_psnr"] - step["loss"]
-        return self.found["test_ws_psnr"] - (control["test_ws_psnr"] - step["test_ws_psnr"])
+        return self.found["ws_psnr"] - step["loss"]
 
 
 def searched(run_set: RunSet) -> DataFrame:
@@ -97,7 +94,7 @@ def by_method(found: Sequence[Curve]) -> dict[str, list[Curve]]:
 
 
 def _count(own: Curve, number: int | None) -> float | None:
-    """Return the count of a candidate that `padgs smallest` names; None in results that name none."""
+    """Return the count of a candidate that `padgs smallest` names, if any."""
     return None if number is None else own.found["steps"][number]["blended"]
 
 
@@ -107,8 +104,7 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
         Column(f"minimal count for {loss:g} dB", 0, False): lambda own, e=f"{loss:g}": own.smallest[e]["blended"]
         for loss in SMALLEST_LOSSES
     },
-    Column(f"at least, for {STATED} dB", 0): lambda own: _count(own, own.found.get("possible", {}).get(STATED)),
-    Column(f"by test views, for {STATED} dB", 0): lambda own: _count(own, own.found.get("by_test", {}).get(STATED)),
+    Column(f"at least, for {STATED} dB", 0): lambda own: _count(own, own.found["possible"][STATED]),
     Column(f"share for {STATED} dB", 2): lambda own: own.smallest[STATED]["rows"] / own.found["rows"],
     Column("knee", 0): lambda own: _count(own, own.found["knee"]),
     Column(f"MB for {STATED} dB", 2, False): lambda own: own.smallest[STATED]["bytes"] / 1e6,
@@ -202,7 +198,7 @@ def _draw(panel: Any, curve: Curve, quantity: str, unit: float, color: str, *, f
 
 
 def _numbers(name: str, found: list[Curve]) -> DataFrame:
-    quantities = ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr", "test_ws_psnr", "lpips")
+    quantities = ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr", "lpips")
     rows = [
         {"chart": name, "curve": curve.title, "preset": curve.preset, **{q: step[q] for q in quantities}}
         | {"smallest for": " ".join(loss for loss, at in curve.smallest.items() if at is step)}

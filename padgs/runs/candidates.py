@@ -13,12 +13,13 @@ import torch
 from padgs.evaluation.metrics import BANDS, band_rows, sphere_weight
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.results import Scores
-from padgs.scene import View
+from padgs.scene import Scene, View
 
 QUALITY, PERCEPTION = "ws_psnr", str(PROTOCOLS["sphere"].lpips_name)
 STEP = 0.7  # share of the rows that each candidate keeps of the last one until the largest loss is exceeded
 CLOSE = 1.2  # the bisection ends at this ratio of two counts
 MIN_ROWS = 10
+MIN_VIEWS = 3  # test views; the bound of two is 13 times as far from their mean as their spread
 CONFIDENCE, MAX_LPIPS_RISE = 0.95, 0.005
 BAND, WORST = 2.0, 5.0  # a latitude band may lose so many epsilons on average, a view so many
 MIN_SHARE = 0.02  # of the sphere; smaller latitude bands, or what masks leave of them, decide nothing
@@ -34,8 +35,7 @@ class Candidate:
     blended: int  # Gaussians that contribute to any training view
     bytes: int
     frame_ms: float  # the shortest of some frames
-    scores: Scores  # of the validation views
-    test_ws_psnr: float | None  # of the test views, which decide nothing
+    scores: Scores  # of the test views
     seconds: float  # of pruning, refinement and measuring
     cpu_seconds: float
 
@@ -66,6 +66,16 @@ def objections(candidate: Scores, control: Scores, epsilon: float, shares: Share
     if rises and not (rise := float(np.mean([*rises.values()]))) <= MAX_LPIPS_RISE:
         found.append(f"LPIPS rises by {rise:.4f}")
     return tuple(found)
+
+
+def deciding_views(scene: Scene) -> tuple[View, ...]:
+    """Return the test views; a ValueError if they are too few for the search for the smallest model."""
+    if len(scene.test) < MIN_VIEWS:
+        raise ValueError(
+            f"{len(scene.test)} test views are too few for the search for the smallest model, which compares at least "
+            f"{MIN_VIEWS} that no model was trained on; hold out more, e.g. every fourth by data.test_every=4"
+        )
+    return scene.test
 
 
 def band_shares(view: View) -> dict[str, float]:
@@ -99,7 +109,7 @@ def lower_bound(changes: Sequence[float]) -> float:
 
 
 def loss(candidates: Sequence[Candidate], candidate: Candidate) -> float:
-    """Return the mean WS-PSNR in dB that a candidate loses against the control on the validation views."""
+    """Return the mean WS-PSNR in dB that a candidate loses against the control."""
     return float(np.mean([*differences(candidates[0].scores, candidate.scores, QUALITY).values()]))
 
 
@@ -116,13 +126,6 @@ def smallest_possible(candidates: Sequence[Candidate], epsilon: float) -> Candid
     """
     losses = ((c, differences(candidates[0].scores, c.scores, QUALITY)) for c in candidates)
     return min((c for c, own in losses if lower_bound([*own.values()]) <= epsilon), key=lambda one: one.rows)
-
-
-def smallest_by_test(candidates: Sequence[Candidate], epsilon: float) -> Candidate | None:
-    """Return the smallest candidate whose mean loss on the test views is at most `epsilon` dB; None without them."""
-    measured = [(c, c.test_ws_psnr) for c in candidates if c.test_ws_psnr is not None]
-    good = (candidate for candidate, quality in measured if measured[0][1] - quality <= epsilon)
-    return min(good, key=lambda candidate: candidate.rows, default=None)
 
 
 def next_count(candidates: Sequence[Candidate], losses: Sequence[float], shares: Shares) -> int | None:

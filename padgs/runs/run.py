@@ -22,13 +22,14 @@ from padgs.data.capture import DataError
 from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
 from padgs.results import STATUSES, STOP_REQUESTED, Result
+from padgs.runs.candidates import deciding_views
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig, choose_device
 from padgs.runs.console import LiveLine, introduce, say, show_result
 from padgs.runs.interrupt import STOP_SIGNALS, Interrupt, Interrupted
 from padgs.runs.store import Progress, RunBusy, RunFolderError, RunStore, config_hash
 from padgs.scene import Scene
-from padgs.training.health import Failure, is_out_of_memory, memory_reason, validation_folds, validation_split
+from padgs.training.health import Failure, is_out_of_memory, memory_reason, validation_split
 from padgs.training.loop import Record
 from padgs.training.method import Method
 from padgs.training.options import AUTO
@@ -43,6 +44,8 @@ RETRIED = STATUSES.keys() - {"ok", "timeout"}  # statuses that retry=failed star
 
 class Callback:
     """Follows a run and may stop it; this one does nothing."""
+
+    is_candidate = False  # of a search for the smallest model, which a request to stop and score cuts none short
 
     def started(self, folder: Path) -> None:
         """Take note of the run folder, before anything is written there."""
@@ -96,8 +99,7 @@ def run(
                         progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                         probed = _log(config, scene, store, record, method)
                         interrupted = interrupt.requested
-                        is_candidate = config.train.hold_out is not None  # of a search for the smallest model
-                        ending = stop.requested and not (method.ended or is_candidate)
+                        ending = stop.requested and not (method.ended or callback.is_candidate)
                         ending = ending and method.request_stop(STOP_REQUESTED)
                         every = config.run.checkpoint_every
                         due = every is not None and record.iteration % every == 0
@@ -165,7 +167,7 @@ def load_scene(config: RunConfig, device: torch.device) -> Scene:
     if config.budget.stop == AUTO:
         validation_split(scene.train)
     if config.smallest == "on":
-        validation_folds(scene.train)
+        deciding_views(scene)
     return scene
 
 

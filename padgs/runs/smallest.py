@@ -2,17 +2,17 @@
 
 The search is a bisection over `budget.gaussians`. Each candidate is an ordinary run in RUN/smallest: it starts from the
 model of RUN (`init`), prunes the least important Gaussians or anchors, and refines the others (`train.refine`) for 4 %
-of the iterations, without the validation views (`train.hold_out`), a quarter of the training views. With fewer than 32
-training views it is several runs, each without another quarter, and their validation views are pooled.
+of the iterations.
 
-The validation views decide. RUN was trained on them; a candidate forgets them in part, and gains from more training.
-So it is compared with the control, which is refined likewise and keeps all Gaussians. The smallest model is the
-smallest candidate that is not inferior to the control.
+The test views decide, because RUN was trained on all others: of these a smaller model forgets what it knew by heart,
+whether a view in between needs it or not (docs/smallest.md). A candidate gains from more training, so it is compared
+with the control, which is refined likewise and keeps all Gaussians. The smallest model is the smallest candidate that
+is not inferior to the control.
 """
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import cycle, islice
@@ -28,11 +28,11 @@ from rich.table import Column, Table
 
 from padgs import results
 from padgs.clock import Lap, timed
-from padgs.evaluation.evaluate import evaluate, mean_metrics
+from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.methods.splats.importance import importance_scores
-from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, Result, Scores
+from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, Result
 from padgs.runs import candidates
 from padgs.runs.config import BudgetOptions, RunConfig
 from padgs.runs.console import MISSING, number, say
@@ -41,13 +41,10 @@ from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import Callback, run, start
 from padgs.runs.store import Labels
 from padgs.runs.warm_start import WarmStart
-from padgs.scene import View
-from padgs.training.health import validation_folds
 from padgs.training.schedule import Pace
 
 EXPERIMENT = FOLDER = "smallest"
 RULES = PROTOCOLS["sphere"]
-TEST_RULES = replace(RULES, lpips="none")  # the test views decide nothing
 REFINED = 0.04  # share of the run's iterations in a refinement
 FRAMES = 10  # timed; the smallest time counts, since other programs only add to it
 
@@ -63,8 +60,7 @@ class Search:
         self.run, self._result, self._stop_requested = run, run.result, stop_requested
         self._console = console
         self._load = partial(load_run, data_path=run.config.data.path, device=run.config.run.device)
-        self.folds = [[run.scene.train[index] for index in fold] for fold in validation_folds(run.scene.train)]
-        self.shares = {view.name: candidates.band_shares(view) for fold in self.folds for view in fold}
+        self.shares = {view.name: candidates.band_shares(view) for view in candidates.deciding_views(run.scene)}
         self.row, self.rows = next(iter(run.method.model.counts().items()))
         self.candidates: list[candidates.Candidate] = []
 
@@ -83,54 +79,40 @@ class Search:
                 count = candidates.next_count(self.candidates, SMALLEST_LOSSES, self.shares)
 
     def _candidate(self, count: int, stop_requested: Callable[[], bool]) -> candidates.Candidate:
-        """Return a candidate of `count` rows, with the validation views of all folds."""
-        parts = [self._of_fold(count, fold, stop_requested) for fold in range(len(self.folds))]
-        views = {name: metrics for part in parts for name, metrics in part["scores"]["views"].items()}
-        test = [part["test_ws_psnr"] for part in parts]
-        measured: dict[str, Any] = {
-            name: math.fsum(part[name] for part in parts) for name in ("seconds", "cpu_seconds")
-        }
-        measured["scores"] = Scores({}, mean_metrics([*views.values()]), views)
-        measured["test_ws_psnr"] = None if None in test else float(np.mean(test))
-        return candidates.Candidate(**parts[0] | measured)
-
-    def _of_fold(self, count: int, fold: int, stop_requested: Callable[[], bool]) -> dict[str, Any]:
-        """Train and measure a model of `count` rows without the views of a fold, unless an earlier search did."""
+        """Train and measure a model of `count` rows, unless an earlier search did."""
         lap, folder = Lap(), self.run.folder / FOLDER
-        result = self._trained(self._config(count, str(folder), fold), stop_requested)
+        result = self._trained(self._config(count, str(folder)), stop_requested)
         if not result.smallest:
             loaded = self._load(folder / result.run)
-            measured = self._measured(loaded, self.folds[fold])
-            measured["test_ws_psnr"] = result.scores[RULES.name].metrics[candidates.QUALITY] if result.scores else None
+            measured = self._measured(loaded)
             measured["seconds"], measured["cpu_seconds"] = lap.seconds()
             with loaded.files:
                 result = loaded.files.finish(replace(result, smallest=measured))
-        return dict(result.smallest)
+        return candidates.Candidate(**result.smallest, scores=result.scores[RULES.name])
 
-    def _measured(self, run: LoadedRun, validation: Sequence[View]) -> dict[str, Any]:
-        views, scene, device = islice(cycle(validation), FRAMES), self.run.scene, self.run.scene.points.device
+    def _measured(self, run: LoadedRun) -> dict[str, Any]:
+        scene, device = self.run.scene, self.run.scene.points.device
+        views = islice(cycle(scene.test), FRAMES)
         times = [timed(lambda view=view: run.method.render(view), device)[1] for view in views]
-        scores = evaluate(run.method.render, validation, RULES)
         return {
             "run": run.folder.name,
             "rows": next(iter(run.method.model.counts().values())),
             "blended": importance_scores(run.method.model, scene.train).blended,
             "bytes": run.method.size().bytes,
             "frame_ms": 1000 * min(times),
-            "scores": asdict(replace(scores, protocol={}, notes=())),
         }
 
     def keep(self, epsilon: float) -> Result:
         """Search, and keep the smallest model for a loss, refined, as a run beside RUN; return RUN's result."""
         self.complete()
         count = candidates.smallest(self.candidates, epsilon, self.shares).rows
-        config = self._config(count, str(self.run.folder.resolve().parent), None)
+        config = self._config(count, str(self.run.folder.resolve().parent))
         variant = ", ".join(filter(None, (self.run.config.variant, f"smallest {epsilon:g} dB")))
         labels = Labels(config.labels.preset, (EXPERIMENT,))
         config = replace(config, variant=variant, labels=labels, protocols=self.run.config.protocols)
-        kept = self._trained(config, self._stop_requested)
-        if self.run.scene.test:
-            self._save_picture(self.run.folder / SMALLEST_PICTURE)
+        options = replace(config.run, pictures=self.run.config.run.pictures)
+        kept = self._trained(replace(config, run=options), self._stop_requested)
+        self._save_picture(self.run.folder / SMALLEST_PICTURE)
         found = self.front() | {"kept": {"epsilon": epsilon, "run": kept.run}}
         result = self.run.files.result() or self._result  # other commands may have added experiments or scores
         served = results.joined(result.experiments, (EXPERIMENT,))
@@ -140,24 +122,22 @@ class Search:
         """Return what the search found, for `Result.smallest`.
 
         Returns:
-            row: gaussians or anchors; rows: of the searched run; test_ws_psnr: of the searched run; minimal, possible,
-            by_test: epsilon -> index of `smallest`, `smallest_possible`, `smallest_by_test` (or None); knee: index, or
-            None; steps: all candidates, the control first, each with its loss against the control and the objections
-            at each epsilon; validation: names of views; seconds, cpu_seconds: of all candidates.
+            row: gaussians or anchors; rows, ws_psnr: of the searched run; minimal, possible: epsilon -> index of
+            `smallest`, `smallest_possible`; knee: index, or None; steps: all candidates, the control first, each with
+            its loss against the control and the objections at each epsilon; views: names of those that decide;
+            seconds, cpu_seconds: of all candidates.
         """
-        found, bend, test = self.candidates, candidates.knee(self.candidates), self.run.scene.test
-        by_test = {epsilon: candidates.smallest_by_test(found, epsilon) for epsilon in SMALLEST_LOSSES}
-        metrics = evaluate(self.run.method.render, test, TEST_RULES).metrics if test else {}
+        found, bend = self.candidates, candidates.knee(self.candidates)
+        whole = evaluate(self.run.method.render, self.run.scene.test, replace(RULES, lpips="none"))
         return {
             "row": self.row,
             "rows": self.rows,
-            "test_ws_psnr": metrics.get(candidates.QUALITY),
+            "ws_psnr": whole.metrics[candidates.QUALITY],
             "minimal": {f"{e:g}": found.index(candidates.smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
             "possible": {f"{e:g}": found.index(candidates.smallest_possible(found, e)) for e in SMALLEST_LOSSES},
-            "by_test": {f"{e:g}": None if one is None else found.index(one) for e, one in by_test.items()},
             "knee": None if bend is None else found.index(bend),
             "steps": [self._described(one) for one in found],
-            "validation": [*self.shares],
+            "views": [*self.shares],
             "seconds": math.fsum(one.seconds for one in found),
             "cpu_seconds": math.fsum(one.cpu_seconds for one in found),
         }
@@ -170,16 +150,15 @@ class Search:
         found = {f"{e:g}": list(candidates.objections(one.scores, control, e, self.shares)) for e in SMALLEST_LOSSES}
         return values | {"objections": found}
 
-    def _config(self, count: int, folder: str, hold_out: int | None) -> RunConfig:
-        """Return the configuration of the run that prunes to `count` rows and refines them without one fold."""
-        config, views = self.run.config, len(self.run.scene.train) - max(map(len, self.folds))
+    def _config(self, count: int, folder: str) -> RunConfig:
+        """Return the configuration of the run that prunes to `count` rows and refines them."""
+        config, views = self.run.config, len(self.run.scene.train)
         schedule = self.run.method.state().values["schedule"]  # of a budget of seconds it is known afterwards
         train = replace(
             config.train,
             iterations=max(views, round(REFINED * schedule)),
             learning_rates=Pace.of(self.run.method.train_options.learning_rates, schedule).factor,
             refine=True,
-            hold_out=hold_out,
             max_seconds=None,
             monitor=False,  # in so few iterations, views that differ look like divergence
         )
@@ -188,8 +167,8 @@ class Search:
             train=train,
             budget=BudgetOptions(gaussians=None if count == self.rows else count),
             init=WarmStart.of(str(self.run.folder), config.method),
-            run=replace(config.run, folder=folder, pictures=config.run.pictures and hold_out is None),
-            protocols={RULES.name: TEST_RULES},
+            run=replace(config.run, folder=folder, pictures=False),
+            protocols={RULES.name: RULES},
             labels=Labels(self._result.preset),
         )
 
@@ -197,6 +176,7 @@ class Search:
         start(config)
         callback = Callback()
         callback.stop_requested = stop_requested  # type: ignore[method-assign]
+        callback.is_candidate = True
         result = run(config, Console(quiet=True), callback, self.run.scene)
         if not result.ok:
             raise ValueError(f"{config.run.folder}/{result.run} ended with status {result.status} ({result.reason})")
@@ -232,22 +212,21 @@ def show(found: dict[str, Any], console: Console) -> None:
     """Print the smallest model for each loss, the knee, and the cost of the search."""
     steps = found["steps"]
     table = Table(Column("loss", no_wrap=True), box=SIMPLE_HEAD, pad_edge=False)
-    for column in (found["row"], "interval", "by test", "MB", "ms", "dB lost", "test dB"):
+    for column in (found["row"], "interval", "MB", "ms", "dB lost", "dB"):
         table.add_column(column, justify="right", no_wrap=True)
     titled = {"control": 0, **{f"{epsilon} dB": at for epsilon, at in found["minimal"].items()}, "knee": found["knee"]}
     for title, at in titled.items():
         if at is None:
-            table.add_row(title, *[MISSING] * 7)
+            table.add_row(title, *[MISSING] * 6)
             continue
         step, epsilon = steps[at], title.removesuffix(" dB")
-        least, tested = found["possible"].get(epsilon), found["by_test"].get(epsilon)
+        least = found["possible"].get(epsilon)
         interval = MISSING if least is None else f"{min(steps[least]['rows'], step['rows'])}–{step['rows']}"
-        by_test = MISSING if tested is None else str(steps[tested]["rows"])
         costs = f"{step['bytes'] / 1e6:.2f}", f"{step['frame_ms']:.1f}"
-        quality = f"{step['loss']:.2f}", number("psnr", step["test_ws_psnr"])
-        table.add_row(title, str(step["rows"]), interval, by_test, *costs, *quality)
+        quality = f"{step['loss']:.2f}", number("psnr", step["ws_psnr"])
+        table.add_row(title, str(step["rows"]), interval, *costs, *quality)
     console.print(table)
     console.print(
-        f"Decided by {len(found['validation'])} validation views; interval: with 90 % confidence; by test: what the "
-        f"test views would say. The search took {found['seconds']:.0f} s, {found['cpu_seconds']:.0f} s of CPU time."
+        f"Decided by {len(found['views'])} test views; interval: with 90 % confidence. The search took "
+        f"{found['seconds']:.0f} s, {found['cpu_seconds']:.0f} s of CPU time."
     )

@@ -29,7 +29,6 @@ MORE = 10  # times the initial number of Gaussians or anchors, or the pixels of 
 ADVICE = "train.monitor=false lets such a run continue"
 
 VALIDATION_SHARE, MIN_VALIDATION = 8, 3  # one of so many training views is held out, and at least so many are
-MIN_POOLED = 8  # validation views of a search for the smallest model
 FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes through
 GAIN = 0.02  # dB; a smaller gain ...
 PATIENCE = 0.05  # ... within this share of the schedule stops the run
@@ -179,23 +178,6 @@ def validation_split(views: Sequence[View]) -> tuple[int, ...]:
             f"on; it takes {2 * MIN_VALIDATION}"
         )
     return tuple(int((number + 0.5) * len(views) / count) for number in range(count))
-
-
-def validation_folds(views: Sequence[View]) -> list[tuple[int, ...]]:
-    """Return the validation views (indices) of the search for the smallest model, a quarter of the training views.
-
-    Where that is fewer than `MIN_POOLED`, there are further folds, each measured on models that train without it.
-    """
-    if len(views) < MIN_POOLED:
-        raise ValueError(
-            f"{len(views)} training views are too few for the search for the smallest model; it measures at least "
-            f"{MIN_POOLED} that its models are not trained on"
-        )
-    folds: list[tuple[int, ...]] = []
-    for first in (2, 0, 3, 1):
-        if sum(map(len, folds)) < MIN_POOLED:
-            folds.append(tuple(range(first, len(views), 4)))
-    return folds
 
 
 @torch.no_grad()

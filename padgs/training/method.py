@@ -18,7 +18,7 @@ from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
 from padgs.training.corrections import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, PoseRefinement
-from padgs.training.health import is_out_of_memory, validation_folds
+from padgs.training.health import is_out_of_memory
 from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer
 from padgs.training.model import Model, Prunable, Record, Refined, Size, State
@@ -92,14 +92,6 @@ class Method(ABC):
         if budget.seconds is not None:
             known = None if self._loaded_state is None else self._loaded_state.values["schedule"]
             budget = replace(budget, iterations=known or self._schedule_length(scene, budget, lap))
-        if (fold := self.train_options.hold_out) is not None:
-            folds = validation_folds(scene.train)
-            if fold >= len(folds):
-                raise ValueError(f"train.hold_out is {fold}; the folds of this scene are 0 to {len(folds) - 1}")
-            if self._views_learn and self._warm_start_state is not None:
-                rule = "init has corrections of all views, in their order; set one of both to null"
-                raise ValueError(f"train.hold_out is {fold}, but {rule}")
-            scene = replace(scene, train=tuple(v for n, v in enumerate(scene.train) if n not in folds[fold]))
         self._model = trained = self._initial_model(scene, budget.iterations)
         if self.train_options.refine:
             trained = Refined(self._model, self.train_options.learning_rates, budget.iterations)

@@ -96,7 +96,6 @@ class TrainOptions:
     # view, which are fitted to each render.
     depth_kind: str = "measured"
     refine: bool = False  # with init: neither densify nor prune; the model's rates are those of the last fifth
-    hold_out: int | None = None  # train without a fold of the views: `padgs.training.health.validation_folds`
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
@@ -109,4 +108,3 @@ class TrainOptions:
         else:
             check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "learning_rates")
         check(self, "at least 1", lambda every: every >= 1, "check_every")
-        check(self, "the number of a fold, from 0, or null", lambda fold: fold is None or fold >= 0, "hold_out")

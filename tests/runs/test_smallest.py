@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from dataclasses import replace
 from statistics import mean
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from rich.console import Console
+from support.tiny_scene import tiny_scene
 from typer.testing import CliRunner
 
 import padgs
@@ -19,15 +21,23 @@ from padgs.multirun.composition import composing, configuration
 from padgs.results import SMALLEST_LOSSES, Scores
 from padgs.runs import candidates as rules
 from padgs.runs import smallest as search
-from padgs.runs.candidates import Candidate, band_shares, knee, loss, lower_bound, next_count, objections
+from padgs.runs.candidates import (
+    Candidate,
+    band_shares,
+    deciding_views,
+    knee,
+    loss,
+    lower_bound,
+    next_count,
+    objections,
+)
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.run import Callback, load_scene, run, start
 from padgs.runs.smallest import Search, find_smallest
 from padgs.scene import View
-from padgs.training.health import validation_folds
 
 SETTINGS = (
-    *("train.iterations=60", "data.generator.width=48", "data.generator.train_views=8", "data.generator.test_views=2"),
+    *("train.iterations=60", "data.generator.width=48", "data.generator.train_views=8", "data.generator.test_views=4"),
     *("data.generator.samples=1", "data.generator.points=300", "protocol=sphere", "protocol.sphere.lpips=none"),
     *("run.device=cpu", "run.threads=1", "tracking=none"),
 )
@@ -43,8 +53,8 @@ def scores(*views: float, lpips: float | None = 0.1, **bands: float) -> Scores:
     return Scores({}, {"ws_psnr": mean(views), "ws_lpips_alex": lpips}, each)
 
 
-def candidate(rows: int, *views: float, test: float | None = None) -> Candidate:
-    return Candidate("", rows, rows, rows, 1.0, scores(*views), test, 0.0, 0.0)
+def candidate(rows: int, *views: float) -> Candidate:
+    return Candidate("", rows, rows, rows, 1.0, scores(*views), 0.0, 0.0)
 
 
 def view(mask: torch.Tensor | None = None) -> View:
@@ -129,34 +139,28 @@ def test_bands_count_by_what_masks_leave_of_them_and_small_ones_decide_nothing()
     assert objections(of_one_view, control, 0.1, {**shares(3), "0": half}) == ()
 
 
-def test_the_interval_of_the_minimal_count_and_what_test_views_say():
+def test_the_interval_of_the_minimal_count():
     found = [
-        candidate(1000, 30.0, 30.0, 30.0, test=29.0),
-        candidate(700, 30.0, 30.0, 30.0, test=28.95),  # surely as good
-        candidate(500, 30.1, 29.9, 29.8, test=28.92),  # perhaps
-        candidate(300, 29.5, 29.6, 29.5, test=28.8),  # surely not
+        candidate(1000, 30.0, 30.0, 30.0),
+        candidate(700, 30.0, 30.0, 30.0),  # surely as good
+        candidate(500, 30.1, 29.9, 29.8),  # perhaps
+        candidate(300, 29.5, 29.6, 29.5),  # surely not
     ]
     assert rules.smallest(found, 0.1, shares(3)).rows == 700
-    assert rules.smallest_possible(found, 0.1).rows == rules.smallest_by_test(found, 0.1).rows == 500
-    assert rules.smallest_by_test([candidate(10, 30.0, 30.0)], 0.1) is None
+    assert rules.smallest_possible(found, 0.1).rows == 500
 
 
-@pytest.mark.parametrize(("views", "sizes"), [(8, [2, 2, 2, 2]), (24, [6, 6]), (31, [8]), (48, [12])])
-def test_a_quarter_of_the_views_and_at_least_eight_are_validation_views(views, sizes):
-    folds = validation_folds(list(range(views)))  # type: ignore[arg-type]
-    assert [*map(len, folds)] == sizes and len(set().union(*folds)) == sum(sizes) >= 8
-    assert {second - first for fold in folds for first, second in zip(fold, fold[1:], strict=False)} == {4}
-
-
-def test_fewer_views_than_eight_are_refused():
-    with pytest.raises(ValueError, match="7 training views are too few .* at least 8"):
-        validation_folds(list(range(7)))  # type: ignore[arg-type]
+def test_fewer_test_views_than_three_are_refused_with_a_way_out():
+    three = replace(tiny_scene(), test=tiny_scene().train[:3])
+    assert deciding_views(three) is three.test
+    with pytest.raises(ValueError, match="2 test views are too few .* at least 3 .* data.test_every=4"):
+        deciding_views(replace(three, test=three.test[:2]))
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch, tmp_path):
     """Search few counts, without LPIPS."""
-    monkeypatch.setattr(search, "RULES", search.TEST_RULES)
+    monkeypatch.setattr(search, "RULES", replace(search.RULES, lpips="none"))
     monkeypatch.setattr(rules, "MIN_ROWS", 130)
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "cache"))
 
@@ -209,8 +213,12 @@ def test_a_search_writes_what_it_found_and_keeps_the_smallest_model_as_a_run(loa
     assert kept.score("sphere").metrics == pytest.approx(kept.scores["sphere"].metrics, nan_ok=True)
     assert np.array(Image.open(loaded.folder / "smallest.png")).shape == (24, 4 * 48, 3)
     assert "1 dB" in shown.get() and kept.folder.name in shown.get()
-    assert len(found["validation"]) == 8 and "Decided by 8 validation views" in " ".join(shown.get().split())
-    assert all(found["possible"][e] is not None and found["by_test"][e] is not None for e in found["minimal"])
+    views = [view.name for view in loaded.scene.test]
+    assert found["views"] == views and f"Decided by {len(views)} test views" in " ".join(shown.get().split())
+    assert found["ws_psnr"] == pytest.approx(loaded.result.scores["sphere"].metrics["ws_psnr"])
+    control, *others = found["steps"]
+    assert all(step["loss"] == pytest.approx(control["ws_psnr"] - step["ws_psnr"]) for step in others)
+    assert found["possible"].keys() == found["minimal"].keys()
     assert "interval" in shown.get() and f"–{rows[found['minimal']['1']]}" in shown.get()
     candidates = sorted((loaded.folder / "smallest").glob("*/result.json"))
     written = [path.stat().st_mtime_ns for path in candidates]
@@ -244,7 +252,7 @@ def test_an_interrupted_search_resumes_to_the_same_candidates(load):
 
 def test_a_warm_start_prunes_the_least_important_rows_to_its_budget_and_refinement_keeps_their_number(load, tmp_path):
     folder = load("method=omnigs").folder
-    for more in ([], ["train.refine=true", "train.hold_out=3"]):
+    for more in ([], ["train.refine=true"]):
         settings = [*SETTINGS, "method=omnigs", f"init={folder}", "budget.gaussians=100", *more]
         with composing():
             config = configuration([*settings, f"run.folder={tmp_path}/{len(more)}"])

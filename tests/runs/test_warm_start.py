@@ -19,7 +19,6 @@ from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.run import Callback, load_scene, run
 from padgs.runs.store import RunStore
-from padgs.training.health import validation_folds
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.targets import halved
 
@@ -179,29 +178,6 @@ def test_learned_poses_are_taken_over_at_another_size_without_the_map_of_the_cam
     taken, given = (one.state().under("views/poses.") for one in (second, first))
     assert given["shifts.0"].any() and all(torch.equal(taken[name], given[name]) for name in given)
     assert not second.state().tensors["views/lens.offsets"].any()
-
-
-def test_views_that_are_held_out_give_neither_points_nor_corrections():
-    scene, kind = tiny_scene(), lookup(METHODS, "padgs_plus", "method")
-    again = (replace(view, name=f"{view.name} again") for view in scene.train)
-    scene = replace(scene, train=(*scene.train, *again))
-    held, *_ = validation_folds(scene.train)
-
-    def red(view):
-        return replace(view, load_pixels=lambda: torch.tensor([255, 0, 0], dtype=torch.uint8) + 0 * view.load_pixels())
-
-    train = tuple(red(view) if number in held else view for number, view in enumerate(scene.train))
-    for views, is_red in ((train, False), (tuple(map(red, scene.train)), True)):
-        method = kind(train=replace(kind.TRAIN, hold_out=0))
-        method.fit(replace(scene, train=views), Budget(10))
-        colors = method.model.splats.gaussians(scene.train[0]).colors
-        assert ((colors[:, 0] > 0.9) & (colors[:, 1:] < 0.1).all(-1)).any() == is_red
-    first = kind(train=replace(kind.TRAIN, exposures="learned"))
-    list(first.fit(scene, Budget(4)))
-    second = kind(train=replace(kind.TRAIN, exposures="learned", hold_out=0))
-    second.warm_start(first.state())
-    with pytest.raises(ValueError, match="train.hold_out is 0, but init has corrections of all views"):
-        second.fit(scene, Budget(4))
 
 
 @pytest.mark.parametrize("name", ["cubemap_3dgs", "crops_3dgs"])

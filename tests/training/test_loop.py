@@ -284,7 +284,6 @@ def test_out_of_memory_is_a_status_and_other_errors_are_not():
         ({"normalisation": "sum"}, "unknown normalisation 'sum'; known: mean, channel_sum"),
         ({"lambda_l1": 1.2}, r"lambda_l1 is 1\.2"),
         ({"check_every": 0}, "check_every is 0"),
-        ({"hold_out": -1}, "hold_out is -1; it must be the number of a fold"),
     ],
 )
 def test_wrong_options_are_named(options, message):
