@@ -30,7 +30,8 @@ BEFORE |= {"train.hold_out": None}
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
-LINEAR, LINEAR_ITERATIONS = ("omnigs", "odgs", "op43dgs", "sc_omnigs"), 3000  # methods with a law of their own for learning rates
+LINEAR = ("omnigs", "odgs", "op43dgs", "sc_omnigs")  # methods with a law of their own for learning rates
+LINEAR_ITERATIONS = 3000
 LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.targets`, without torch
 
 
