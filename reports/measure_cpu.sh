@@ -29,7 +29,7 @@ D bedroom,basement,court 12 270 +experiment=modulation protocol=both train.itera
 E bedroom,court 6 220 +sweep=tau train.iterations=1500 data.width=256 seed=0 method.tau=0,0.3,0.5,0.7,0.9,1
 E bedroom,court 4 220 +sweep=lambda train.iterations=1500 data.width=256 seed=0 train.lambda_l1=0.2,0.6,0.8,1
 E bedroom,court 4 220 +sweep=voxel_size train.iterations=1500 data.width=256 seed=0 method.voxel_pixels=0.1,1,3,10
-F bedroom,room,basement 21 200 +experiment=equal_time budget.seconds=60 budget.clock=cpu data.width=512 seed=0,1,2 smallest=on method=omnigs,odgs,op43dgs,spags_sorted,spags_tuned,padgs,padgs_plus
+F bedroom,room,basement 21 300 +experiment=all_methods ~scene_set train.iterations=3000 data.width=256 seed=0,1,2 smallest=on method=omnigs,odgs,op43dgs,spags_sorted,spags_tuned,padgs,padgs_plus
 F bedroom,room,basement 105 100 +experiment=capacity train.iterations=1500 data.width=256 seed=0,1,2
 G builtin 95 110 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=omnigs,op43dgs,spags_tuned,padgs,padgs_plus
 G builtin 40 270 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=$released stress.condition=none,world_rotation,seam,pitch,world_scale,few_points,pose_noise,few_views,exposure,noise

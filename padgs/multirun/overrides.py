@@ -120,7 +120,7 @@ def problem(arguments: Sequence[str]) -> str | None:
     >>> problem(["~train", "train.iterations=100"])
     '~train: every run has train settings; choose others by train=NAME, or change a key of them'
     >>> problem(["+sweep=tau", "run.jobs=4"])
-    'run.jobs=4 requires a launcher that runs several jobs at a time, e.g. launcher=local'
+    'run.jobs=4 is for launcher=local or submitit; Slurm reads hydra.launcher.array_parallelism'
     """
     settings: dict[str, str] = {}
     if SHOW in arguments[-1:]:
@@ -151,8 +151,7 @@ def problem(arguments: Sequence[str]) -> str | None:
         return f"launcher={launcher} launches the jobs of a multirun; for this run: {command}"
     jobs = settings.get("run.jobs", "=1").partition("=")[2]
     if jobs != "1" and launcher in ("none", "slurm", "ray") and "hydra/launcher" not in settings:
-        rule = f"is for launcher=local or submitit, and launcher is {launcher}"
-        return f"run.jobs={jobs} {rule}; on Slurm, hydra.launcher.array_parallelism is the number of jobs at a time"
+        return f"run.jobs={jobs} is for launcher=local or submitit; Slurm reads hydra.launcher.array_parallelism"
     return None
 
 
