@@ -92,7 +92,8 @@ class Method(ABC):
         if budget.seconds is not None:
             known = None if self._loaded_state is None else self._loaded_state.values["schedule"]
             budget = replace(budget, iterations=known or self._schedule_length(scene, budget, lap))
-        self._model = trained = self._initial_model(scene, budget.iterations)
+        trained: Any = self._initial_model(scene, budget.iterations)
+        self._model = trained
         if self.train_options.refine:
             trained = Refined(self._model, self.train_options.learning_rates, budget.iterations)
         self._trainer = self.build_trainer(trained, scene, budget, stage)

@@ -48,7 +48,7 @@ class Budget:
     def next_step(self, last: int, spent: float, step_seconds: float, *, skipped: int = 0, began: float = 0.0) -> int:
         """Return the schedule step of the next iteration; `iterations` for the last one.
 
-        `last` is the step of the iteration before, 0 for null; `spent` the seconds of training so far, with building
+        `last` is the step of the iteration before, 0 for none; `spent` the seconds of training so far, with building
         the initial model; `step_seconds` the expected duration of the next iteration; `skipped` the number of steps
         that took no time; `began` the seconds before the first step, after which the schedule fills the rest.
 
