@@ -137,7 +137,7 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, argum
                 ("sede=5", "unknown key sede; known: data, render"),
                 ("method=omnigss", "did you mean omnigs?"),
                 ("seed=0,1", "seed=0,1 has several values; give -m for one run each"),
-                ("variant=a;b", "variant=a;b cannot be read: values with spaces or any of"),
+                ("variant=a;b", "variant=a;b cannot be read: values with spaces or other signs"),
                 ("iterations=5", "did you mean train.iterations?"),
                 ("method=foo", "unknown method 'foo'; known: crops_3dgs"),
                 ("+experiment=foo", "unknown experiment 'foo'; known: ablation"),

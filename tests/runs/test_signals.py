@@ -108,8 +108,8 @@ def test_workers_of_a_multirun_write_checkpoints_and_ignore_other_signals(start,
 
 @pytest.mark.slow
 def test_a_search_keeps_its_candidates_and_sigusr1_cuts_none_short(start, tmp_path):
-    given = [text for text in TINY if not text.startswith(("train.iterations", "data.generator.train_views"))]
-    code, _, error = finish(start(*given, "train.iterations=400", "data.generator.train_views=12"))
+    given = [text for text in TINY if not text.startswith(("train.iterations", "data.generator.test_views"))]
+    code, _, error = finish(start(*given, "train.iterations=400", "data.generator.test_views=3"))
     assert code == 0, error
     (run,) = (path.parent for path in tmp_path.glob("runs/*/result.json"))
     process = start("smallest", str(run), module="padgs.cli.app")
