@@ -108,7 +108,7 @@ def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
                 raise DataError(f"{video} says that it is {otherwise}")
     is_hd = frame.height > _SD_HEIGHT and frame.colorspace == _UNTAGGED
     flags = optional_module("av", video, "video").video.reformatter.Interpolation
-    exact = None  # PyAV before 16 rounds down, up to 2 of 255
+    exact = None  # older versions of PyAV know no flags; colours are then up to 2 of 255 too dark
     if hasattr(flags, "ACCURATE_RND"):
         exact = flags.BICUBIC | flags.ACCURATE_RND | flags.FULL_CHR_H_INT
     return frame.to_ndarray(format="rgb24", src_colorspace="ITU709" if is_hd else None, interpolation=exact)
