@@ -13,52 +13,20 @@ from PIL import Image
 from rich.console import Console
 from support.composed import composed
 from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
+from support.training import ITERATIONS, folder_of, run, stop_at
 
 from padgs import results
-from padgs.data.capture import DataError
 from padgs.evaluation.scoring import probe
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.reports import store
 from padgs.reports.frame import frame
 from padgs.reports.selection import RunSet
-from padgs.runs import checkpoint
 from padgs.runs import run as pipeline
-from padgs.runs.checkpoint import CheckpointError
-from padgs.runs.interrupt import Interrupted
 from padgs.runs.run import Callback, build_method, load_scene
-from padgs.runs.store import Labels, RunBusy, RunFolderError, RunStore
+from padgs.runs.store import Labels, RunBusy, RunFolderError
 from padgs.training.health import Failure
 
-ITERATIONS = 12
-SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")
 PACKAGE = Path(pipeline.__file__).parents[1]
-
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: tiny_scene())
-
-
-@pytest.fixture
-def config(tmp_path):
-    return composed(
-        *SMALL,
-        f"run.folder={tmp_path}/runs",
-        f"train.iterations={ITERATIONS}",
-        "run.log_every=2",
-        "run.probe_every=5",
-    )
-
-
-def run(config) -> tuple[results.Result, str]:
-    out = io.StringIO()
-    return pipeline.run(config, Console(file=out, width=200)), out.getvalue()
-
-
-def folder_of(config) -> RunStore:
-    (path,) = Path(config.run.folder).iterdir()
-    return RunStore(path)
 
 
 def test_a_run_leaves_all_its_files_and_says_where(config):
@@ -190,97 +158,11 @@ def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
     assert folder.result() == first and (folder.path / "log.jsonl").read_bytes() == log
 
 
-def stop_at(iteration: int, monkeypatch, how) -> None:
-    """Do `how` right after an iteration was shown."""
-    update = pipeline.LiveLine.update
-
-    def stopping(self, record, psnr):
-        update(self, record, psnr)
-        if record.iteration == iteration:
-            how()
-
-    monkeypatch.setattr(pipeline.LiveLine, "update", stopping)
-
-
-def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config, monkeypatch, tmp_path):
-    undisturbed, _ = run(replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
-    with monkeypatch.context() as patch:
-        stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
-        with pytest.raises(Interrupted, match="stopped after iteration 8"):
-            run(config)
-    assert checkpoint.load(folder_of(config).checkpoint).values["progress"]["iteration"] == 8
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    resumed, said = run(config)
-    assert "resuming after iteration 8" in said
-    assert resumed.scores == undisturbed.scores
-    same_checkpoint(config, replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
-
-
-def test_ctrl_c_in_the_last_iteration_scores_at_the_next_start(config, monkeypatch):
-    with monkeypatch.context() as patch:
-        stop_at(ITERATIONS - 1, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
-        with pytest.raises(Interrupted, match=f"stopped after iteration {ITERATIONS}, the checkpoint is written"):
-            run(config)
-    assert folder_of(config).result() is None
-    result, _ = run(config)
-    assert result.status == "ok" and result.iterations_done == ITERATIONS
-
-
-def same_checkpoint(one, other) -> None:
-    mine, theirs = (checkpoint.load(folder_of(config).checkpoint) for config in (one, other))
-    assert mine.tensors.keys() == theirs.tensors.keys()
-    assert all(torch.equal(mine.tensors[name], theirs.tensors[name]) for name in mine.tensors)
-
-
-def test_a_crash_between_checkpoints_loses_only_what_came_after(config, monkeypatch, tmp_path):
-    config = replace(config, run=replace(config.run, checkpoint_every=5, log_every=1))
-
-    def crash():
-        raise ZeroDivisionError
-
-    with monkeypatch.context() as patch:
-        stop_at(9, patch, crash)
-        with pytest.raises(ZeroDivisionError):
-            run(config)
-    _, said = run(config)
-    assert "resuming after iteration 5" in said
-    lines = (folder_of(config).path / "log.jsonl").read_text().splitlines()
-    assert [json.loads(line)["iteration"] for line in lines] == list(range(1, ITERATIONS + 1))
-
-
-def test_a_damaged_checkpoint_is_named_and_nothing_is_started(config, monkeypatch):
-    with monkeypatch.context() as patch:
-        stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
-        with pytest.raises(Interrupted):
-            run(config)
-    (tensors,) = folder_of(config).checkpoint.glob("*.safetensors")
-    tensors.write_bytes(tensors.read_bytes()[:-1])
-    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained"))
-    with pytest.raises(CheckpointError, match=tensors.name):
-        run(config)
-    assert not (folder_of(config).path / "result.json").exists()
-
-
 def test_too_few_views_for_early_stopping_are_refused_before_training(config, monkeypatch):
     monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained"))
     with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
         run(replace(config, budget=replace(config.budget, stop="auto")))
     assert not Path(config.run.folder).exists() or not [*Path(config.run.folder).glob("*/result.json")]
-
-
-@pytest.mark.parametrize("change", ["seed=1", "method.features=16", "train.lambda_l1=0.5"])
-def test_a_checkpoint_of_another_run_is_refused(config, monkeypatch, tmp_path, change):
-    other = composed(*SMALL, f"run.folder={tmp_path}/other", f"train.iterations={ITERATIONS}", change)
-    for one in (config, other):
-        with monkeypatch.context() as patch:
-            stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
-            with pytest.raises(Interrupted):
-                run(one)
-    shutil.rmtree(folder_of(config).checkpoint)
-    shutil.copytree(folder_of(other).checkpoint, folder_of(config).checkpoint)
-    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained"))
-    with pytest.raises(CheckpointError, match="is of a run with another configuration; .*delete the checkpoint folder"):
-        run(config)
 
 
 @pytest.mark.parametrize(
@@ -303,38 +185,6 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     assert reasons.get(type(error), str(error)) in result.reason and "Allocator" not in result.reason
     again, said = run(config)
     assert again == result and "retry=failed" in said
-
-
-def test_panoramas_that_cannot_be_read_any_more_interrupt_a_run_and_end_it_not(config, monkeypatch):
-    config = replace(config, run=replace(config.run, checkpoint_every=5))
-
-    def fail():
-        raise DataError("the disk has gone")
-
-    with monkeypatch.context() as patch:
-        stop_at(7, patch, fail)
-        with pytest.raises(DataError, match="the disk has gone"):
-            run(config)
-    result, said = run(config)
-    assert result.status == "ok" and "resuming after iteration 5" in said
-
-
-@pytest.mark.parametrize(("status", "starts_at"), [("nan", 0), ("oom", 5)])
-def test_a_failed_run_is_retried_only_if_asked(config, monkeypatch, status, starts_at):
-    config = replace(config, run=replace(config.run, checkpoint_every=5))
-
-    def fail():
-        raise Failure(status, "for the test")
-
-    with monkeypatch.context() as patch:
-        stop_at(7, patch, fail)
-        failed, _ = run(config)
-    assert failed.status == status and failed.iterations_done == 7 and run(config)[0] == failed
-    (folder_of(config).path / "stop").touch()  # too late
-    retried, said = run(replace(config, retry="failed"))
-    assert retried.status == "ok" and not retried.ended
-    assert ("resuming after iteration 5" in said) == (starts_at == 5)  # what went wrong must not be gone on from
-    assert run(replace(config, retry="failed"))[0] == retried
 
 
 def test_one_frame_lies_between_a_job_and_its_method(config, monkeypatch):

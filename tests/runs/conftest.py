@@ -1,0 +1,25 @@
+"""A configuration of a run on the tiny scene, for tests of what a run does."""
+
+import pytest
+from support.composed import composed
+from support.tiny_scene import tiny_scene
+from support.training import ITERATIONS, SMALL
+
+from padgs.runs import run as pipeline
+
+
+@pytest.fixture
+def tiny(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: tiny_scene())
+
+
+@pytest.fixture
+def config(tmp_path, tiny):
+    return composed(
+        *SMALL,
+        f"run.folder={tmp_path}/runs",
+        f"train.iterations={ITERATIONS}",
+        "run.log_every=2",
+        "run.probe_every=5",
+    )
