@@ -1,5 +1,6 @@
 """Evaluation of renders of test views under a protocol."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
@@ -14,6 +15,8 @@ from padgs.render import Rendering
 from padgs.results import Scores
 from padgs.scene import View
 from padgs.training.health import Failure
+
+MOST_DECIBELS = 100.0  # of a view in the mean over views
 
 Metrics = dict[str, float | None]  # metric -> value; None = missing (no LPIPS weights, or no weighted pixel)
 ExtraMetrics = Callable[[View, Rendering], Metrics]  # metrics that need more than the image
@@ -106,12 +109,15 @@ def cropped_mask(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tens
 def mean_metrics(views: Sequence[Metrics]) -> Metrics:
     """Return the mean of each metric over the views that have it; None if none has.
 
+    An exact view counts as `MOST_DECIBELS`, or an infinite mean would hide the other views.
+
     >>> mean_metrics([{"psnr": 20.0, "seam": None}, {"psnr": 30.0, "seam": None}])
     {'psnr': 25.0, 'seam': None}
     """
     mean: Metrics = {}
     for name in dict.fromkeys(name for metrics in views for name in metrics):
-        present = [value for metrics in views if (value := metrics.get(name)) is not None]
+        most = MOST_DECIBELS if "psnr" in name else math.inf
+        present = [min(value, most) for metrics in views if (value := metrics.get(name)) is not None]
         mean[name] = sum(present) / len(present) if present else None
     return mean
 

@@ -7,13 +7,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.training.model import Model, TrainingRender
 from padgs.training.options import Budget
-from padgs.training.targets import even_weight, image_of
+from padgs.training.targets import BLACK, Target, even_weight, image_of
 
 OUT_OF_MEMORY_MESSAGES = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc")
 
@@ -24,7 +23,7 @@ WORSE = 1.5  # average loss relative to the best
 FALLING = 0.9  # average loss relative to the highest since it rose; below it the loss recovers, as after a reset
 FEWER = 0.01  # share of the initial Gaussians or anchors
 FLATTER = 0.01  # share of the variance of the image
-FAINTEST = 0.05  # mean opacity of a render
+FAINTEST = 0.05  # mean opacity where the photograph counts and is not black
 MORE = 10  # times the initial number of Gaussians or anchors, or the pixels of all training views
 ADVICE = "train.monitor=false lets such a run continue"
 
@@ -144,13 +143,14 @@ class Monitor:
         if since := self._lasting("few", most < FEWER * start, iteration):
             self._fail("collapsed", f"{most} of {start} {name} are left at iteration {iteration}, few since {since}")
 
-    def render(self, rendered: TrainingRender, image: Tensor, iteration: int) -> None:
-        """Check a render against its image [H, W, 3]."""
-        at = f"at iteration {iteration}, and since"
-        alpha = 1 - rendered.rendering.transmittance.detach().mean().item()
+    def render(self, rendered: TrainingRender, target: Target, iteration: int) -> None:
+        """Check a render where its target counts; a black void is to stay empty."""
+        at, image, rendering = f"at iteration {iteration}, and since", target.image, rendered.rendering
+        counts = (target.weight > 0).expand(image.shape[:2])
+        alpha = 1 - rendering.transmittance.detach()[counts & (image.amax(-1) > BLACK)].mean().item()
         if since := self._lasting("faint", alpha < FAINTEST, iteration):
             self._fail("collapsed", f"the mean opacity is {alpha:.3g} {at} {since}")
-        share = (rendered.rendering.image.detach().var() / image.var().clamp(min=1e-12)).item()
+        share = (rendering.image.detach()[counts].var() / image[counts].var().clamp(min=1e-12)).item()
         if since := self._lasting("flat", share < FLATTER, iteration):
             self._fail("collapsed", f"the render has {share:.3g} of the variance of the image {at} {since}")
 

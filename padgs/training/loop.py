@@ -153,7 +153,7 @@ class Trainer:
                 loss = loss + target.squares(image, options, step / self.schedule)
                 loss = loss if view.sphere_share == 1 else view.sphere_share * loss
             if checked:
-                self._monitor.render(rendered, target.image, iteration)
+                self._monitor.render(rendered, target, iteration)
             with stage("backward"):
                 loss.backward()
             with stage("observe"), torch.no_grad():

@@ -78,7 +78,7 @@ class TrainOptions:
     weight: str = "solid_angle"  # M of Eq. 17: solid_angle | uniform | end_rows (as released: 0 at the poles)
     normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
     # published: for 30 000 iterations | run: for the length of this run, see `padgs.training.schedule.Pace` |
-    # run_linear: the law that run stands for with OmniGS, ODGS and OP43DGS |
+    # run_linear: the law that run stands for with OmniGS, SC-OmniGS, ODGS and OP43DGS |
     # a factor on the published ones.
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each

@@ -1,4 +1,5 @@
 import json
+from functools import partial
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from padgs.training.health import Failure, Monitor
 from padgs.training.loop import Budget
 from padgs.training.model import TrainingRender
 from padgs.training.options import TrainOptions
+from padgs.training.targets import Target
 
 ITERATIONS = 1000
 
@@ -122,9 +124,26 @@ def test_pictures_of_nothing_have_collapsed():
         (drawing(photograph, transmittance=0.99), "the mean opacity is 0.01"),
         (drawing(torch.full((4, 8, 3), 0.4)), "of the variance of the image"),
     ):
-        watch = monitor()
-        failure, _ = ends(lambda i, made=made, watch=watch: watch.render(made, photograph, 50 * i), "collapsed")
+        watch, target = monitor(), Target(photograph, torch.ones(4, 1))
+        see = partial(watch.render, made, target)
+        failure, _ = ends(lambda i, see=see: see(50 * i), "collapsed")
         assert said in str(failure) and "at iteration 150, and since 50" in str(failure)
+
+
+def test_a_void_may_stay_empty_and_what_a_mask_hides_does_not_count():
+    photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
+    small = torch.zeros(4, 8)
+    small[1, :2] = 1
+    made = drawing(photograph * small[..., None])
+    made.rendering.transmittance[small == 0] = 1
+    for target in (Target(photograph * small[..., None], torch.ones(4, 1)), Target(photograph, small)):
+        watch = monitor()
+        for iteration in range(1, ITERATIONS):
+            watch.render(made, target, iteration)
+    hidden = drawing(torch.where(small[..., None] > 0, 0.4, photograph))
+    with pytest.raises(Failure, match="of the variance of the image"):
+        for iteration in range(1, ITERATIONS):
+            watch.render(hidden, target, iteration)
 
 
 def test_where_the_schedule_follows_the_clock_a_sign_lasts_for_a_share_of_it():
