@@ -69,4 +69,4 @@ def solid_angle_weight(height: int, *, dtype: torch.dtype = torch.float32, devic
 def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: Device = "cpu") -> Tensor:
     """Return the row weight [H] of the released code: cos(pi i / (H - 1) - pi / 2), 0 in the first and last row."""
     rows = torch.arange(height, dtype=dtype, device=device)
-    return torch.cos(math.pi * rows / (height - 1) - math.pi / 2)
+    return torch.cos(math.pi * rows / (height - 1) - math.pi / 2).clamp(min=0)  # rounding

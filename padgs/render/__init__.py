@@ -13,6 +13,7 @@ from torch import Tensor
 
 from padgs.checks import check_known, lookup
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Pinhole
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
 from padgs.render.ray_blocks import is_in_blocks, rasterize_blocks, seen
@@ -66,8 +67,9 @@ def render(
         view: pose and camera.
         options: projection, bounds, culling; whether a panorama is rendered directly or as a cubemap.
         background: [3] RGB; black if not given.
-        mean_offsets: [N, 2] added to the projected means, in normalised image units (x and y each span 2 across the
-            image, as in 3DGS). For zeros, the gradient after `backward` is the positional gradient of densification.
+        mean_offsets: [N, 2] added to the projected means, in units of which x and y span 2 across the image, as in
+            3DGS; with projections tangent and ray across a full panorama, whatever the camera. For zeros, the gradient
+            after `backward` is the positional gradient of densification.
         absgrad: [N] zeros that change nothing; projection ray only. The gradient after `backward` is the sum over the
             pixels of |dL/dmean| through each pixel alone, which do not cancel (`WithAbsgrad` of backend torch).
         backend: a name of `BACKENDS`, or auto: cpu or cuda, by the device, for float32 tensors if the library is built;
@@ -85,10 +87,12 @@ def _rasterize(name: str, request: Request) -> Rendering:
     rasterize: Backend = lookup(BACKENDS, name, "backend")
     if request.options.cubemap:
         return rasterize_cubemap(rasterize, request)
-    if not is_in_blocks(request.camera):
-        return rasterize(request)
-    if name != "torch":
+    in_blocks = is_in_blocks(request.camera)
+    if in_blocks and name != "torch":
         return rasterize_blocks(rasterize, request)
+    by_rays = isinstance(request.camera, Pinhole) and request.options.projection in ("tangent", "ray")
+    if not in_blocks and not (by_rays and name == "torch"):
+        return rasterize(request)
     rendering = rasterize(request)
     return replace(rendering, visible=rendering.visible & seen(request))
 

@@ -46,7 +46,7 @@ class RenderOptions:
     """Options of the rasterizer. conf/render/released.yaml has those of the published rasterizer."""
 
     projection: str = "erp"  # erp | tangent | ray | pinhole: docs/renderer.md
-    near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
+    near: float = 0.0  # world units; Gaussians whose mean is at most this far away (pinhole: this deep) are culled
     near_cull: str = "mean"  # what must be farther than near: the mean, or ellipsoid (ray): the whole drawn Gaussian
     # variance of the low-pass filter in square pixels (cubemap: of its panorama; perspective image: at its centre)
     low_pass: float = 0.3

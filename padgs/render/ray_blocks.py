@@ -79,7 +79,6 @@ def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice],
     low-pass filter; seen from the camera that is an angle of at most asin(k sigma / r).
     """
     gaussians, options, camera = request.gaussians, request.options, request.camera
-    assert isinstance(camera, RayTable), type(camera)
     means = camera_frame(request)[0]
     if request.mean_offsets is not None:
         means = means + mean_shift(means, request.mean_offsets)
@@ -95,15 +94,15 @@ def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice],
 
 
 @lru_cache(maxsize=16)  # a table takes four times the memory of an image, and views of a camera share one
-def _blocks(camera: RayTable) -> tuple[tuple[RayTable, tuple[slice, slice], Tensor, float], ...]:
+def _blocks(camera: Camera) -> tuple[tuple[RayTable, tuple[slice, slice], Tensor, float], ...]:
     """Return blocks of `BLOCK` x `BLOCK` pixels or fewer, row by row, with axis [3] and half angle of their cones."""
-    found = []
+    found, table = [], camera if isinstance(camera, RayTable) else RayTable(camera.rays(), camera.focal)
     for top in range(0, camera.height, BLOCK):
         for left in range(0, camera.width, BLOCK):
             pixels = slice(top, top + BLOCK), slice(left, left + BLOCK)
-            rays = camera.table[pixels].double().flatten(0, 1)
+            rays = table.table[pixels].double().flatten(0, 1)
             rays = torch.nn.functional.normalize(rays[rays.isfinite().all(1)], dim=1)  # others spoil their pixel only
             axis = torch.nn.functional.normalize(rays.mean(0), dim=0) if len(rays) else rays.new_tensor((0, 0, 1))
             angle = torch.acos((rays @ axis).amin().clamp(-1, 1)).item() if len(rays) else math.pi
-            found.append((replace(camera, table=camera.table[pixels].contiguous()), pixels, axis, angle))
+            found.append((replace(table, table=table.table[pixels].contiguous()), pixels, axis, angle))
     return tuple(found)

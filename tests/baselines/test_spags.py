@@ -20,6 +20,7 @@ from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends.cpu import Projected
 from padgs.render.backends.native import native_camera
 from padgs.scene import Scene
+from padgs.training.health import Failure
 from padgs.training.model import Refined
 
 WIDTH, HEIGHT = 2048, 1024
@@ -110,6 +111,9 @@ def test_invisible_gaussians_are_pruned_at_the_end(scene):
         f"pruned {left_out} invisible Gaussians" in event for event in events
     )
     assert torch.equal(model.render(scene.test[0]).image, image)
+    model.splats.opacity_logits.data.fill_(-9.0)
+    with pytest.raises(Failure, match="all .* Gaussians are invisible"):
+        model.adapt(100, torch.optim.Adam(model.splats.parameters()))
 
 
 def test_boxes_are_tight_and_published_boxes_are_not(generator):

@@ -1,11 +1,13 @@
 """Equivalent descriptions of a camera: formula, ray table, or another pose."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from support import render_cases as cases
 
 from padgs.gaussians import Gaussians
-from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable, perspective
 from padgs.render import RenderOptions, render
 from padgs.render.backends.native import native_rays
 
@@ -129,3 +131,15 @@ def test_ray_tables_are_cached_until_they_change():
     second = native_rays(camera).table
     assert first is not None and second is not None and torch.equal(second, -first)
     assert native_rays(camera, torch.device("meta")).table.device.type == "meta"
+
+
+@each_free
+@pytest.mark.parametrize("backend", ["torch", "cpu"])
+def test_what_a_photograph_cannot_show_is_not_visible(projection: str, backend: str):
+    means = torch.tensor([[0.0, 0, 4], [4, 0, 0], [0, -4, 0], [0, 0, -4]])  # ahead, right, above and behind
+    same = (
+        cases.mixture(4, torch.Generator().manual_seed(34)).to(torch.float32).chosen(torch.zeros(4, dtype=torch.long))
+    )
+    gaussians = replace(same, means=means, scales=torch.full((4, 3), 0.05), opacities=torch.full((4,), 0.5))
+    shown = render(gaussians, cases.view_of(perspective(32, 24, 60.0)), RenderOptions(projection), backend=backend)
+    assert shown.visible.tolist() == [True, False, False, False]

@@ -190,7 +190,7 @@ class PaDGS(nn.Module):
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:
     """Return the voxel size, world units: so many pixels of the training panoramas at median depth."""
-    return pixels * math.pi / max(view.height for view in scene.train) * scene.scale
+    return pixels * math.pi / max(view.height for view in scene.panoramas) * scene.scale
 
 
 def cells_from_points(points: Tensor, size: float) -> Tensor:

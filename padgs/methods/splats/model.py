@@ -20,6 +20,7 @@ from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.projection import widened_scales
 from padgs.scene import View
+from padgs.training.health import Failure
 from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.optimizer import keep_rows
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
@@ -167,6 +168,8 @@ class SplatModel:
     def _prune_invisible(self, smooth: SmoothingFilter, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         splats = self.splats
         visible, before = self._rendered_opacities() >= ALPHA_MIN, len(splats)
+        if not visible.any():
+            raise Failure("collapsed", f"all {before} Gaussians are invisible at the end of the run")
         keep_rows(splats.rows(), optimizer, visible)
         self.densifier.reset_statistics()
         smooth.update(splats.means)

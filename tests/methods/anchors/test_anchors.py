@@ -3,11 +3,13 @@
 import json
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from padgs.geometry.camera import perspective
 from padgs.methods.anchors import anchors
 from padgs.native import cpu
 from padgs.render import BACKENDS, RenderOptions, render
@@ -314,7 +316,10 @@ def test_automatic_voxel_size(scale):
     points = scale * torch.tensor([[0.0, 0.0, 5.0], [0.0, 5.0, 0.0], [-5.0, 0.0, 0.0]])
     view = View("v", torch.eye(4, dtype=torch.float64), 400, 200)
     scene = Scene("s", (view,), (), points, torch.zeros(3, 3, dtype=torch.uint8), "0")
-    assert anchors.automatic_voxel_size(scene, 0.25) == pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
+    expected = pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
+    assert anchors.automatic_voxel_size(scene, 0.25) == expected
+    photograph = replace(view, width=3000, height=2000, lens=perspective(3000, 2000, 45.0))
+    assert anchors.automatic_voxel_size(replace(scene, train=(view, photograph)), 0.25) == expected, "of panoramas"
 
 
 def test_invalid_clouds_are_refused():
