@@ -31,6 +31,9 @@ def ctrl_c() -> None:
 @pytest.fixture(autouse=True)
 def signals() -> Iterator[None]:
     """Handlers of signals, and what is known of received ones, are those of before after each test."""
+    for number in interrupt.SIGNALS:
+        if getattr(signal.getsignal(number), "__module__", "") == interrupt.__name__:  # left by a fixture of a file
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     before = {number: signal.getsignal(number) for number in (*interrupt.SIGNALS, signal.SIGUSR1, signal.SIGUSR2)}
     yield
     for number, handler in before.items():

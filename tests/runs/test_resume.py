@@ -18,7 +18,6 @@ from padgs.training.health import Failure
 
 
 def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config, monkeypatch, tmp_path):
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # fixtures of other files may have left another
     undisturbed, _ = run(replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
     with monkeypatch.context() as patch:
         stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
