@@ -15,7 +15,7 @@ from padgs.checks import check_known, lookup
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Pinhole
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
-from padgs.render.cubemap import rasterize_cubemap
+from padgs.render.cubemap import rasterize_cubemap, summed_counters
 from padgs.render.ray_blocks import is_in_blocks, rasterize_blocks, seen
 from padgs.render.supersampling import rasterize_samples
 from padgs.scene import View
@@ -88,13 +88,14 @@ def _rasterize(name: str, request: Request) -> Rendering:
     if request.options.cubemap:
         return rasterize_cubemap(rasterize, request)
     in_blocks = is_in_blocks(request.camera)
-    if in_blocks and name != "torch":
-        return rasterize_blocks(rasterize, request)
-    by_rays = isinstance(request.camera, Pinhole) and request.options.projection in ("tangent", "ray")
-    if not in_blocks and not (by_rays and name == "torch"):
-        return rasterize(request)
+    if name != "torch":
+        return rasterize_blocks(rasterize, request) if in_blocks else rasterize(request)
     rendering = rasterize(request)
-    return replace(rendering, visible=rendering.visible & seen(request))
+    by_rays = isinstance(request.camera, Pinhole) and request.options.projection in ("tangent", "ray")
+    if not in_blocks and not by_rays:
+        return rendering
+    visible = rendering.visible & seen(request)  # it tries all Gaussians in all pixels
+    return replace(rendering, visible=visible, counters=summed_counters([rendering], visible))
 
 
 def make_request(

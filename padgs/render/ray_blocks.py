@@ -73,7 +73,7 @@ def seen(request: Request) -> Tensor:
 
 @torch.no_grad()
 def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice], Tensor]]:
-    """Yield the blocks of a table, row by row, with their pixels and the indices of the Gaussians that reach them.
+    """Yield blocks of the image, row by row, with their pixels and the indices of the Gaussians that reach them.
 
     A Gaussian is drawn within k standard deviations, k^2 = 2 ln(opacity / ALPHA_MIN), along its longest axis with the
     low-pass filter; seen from the camera that is an angle of at most asin(k sigma / r).
@@ -96,13 +96,13 @@ def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice],
 @lru_cache(maxsize=16)  # a table takes four times the memory of an image, and views of a camera share one
 def _blocks(camera: Camera) -> tuple[tuple[RayTable, tuple[slice, slice], Tensor, float], ...]:
     """Return blocks of `BLOCK` x `BLOCK` pixels or fewer, row by row, with axis [3] and half angle of their cones."""
-    found, table = [], camera if isinstance(camera, RayTable) else RayTable(camera.rays(), camera.focal)
+    found, whole = [], camera if isinstance(camera, RayTable) else RayTable(camera.rays(), camera.focal)
     for top in range(0, camera.height, BLOCK):
         for left in range(0, camera.width, BLOCK):
             pixels = slice(top, top + BLOCK), slice(left, left + BLOCK)
-            rays = table.table[pixels].double().flatten(0, 1)
+            rays = whole.table[pixels].double().flatten(0, 1)
             rays = torch.nn.functional.normalize(rays[rays.isfinite().all(1)], dim=1)  # others spoil their pixel only
             axis = torch.nn.functional.normalize(rays.mean(0), dim=0) if len(rays) else rays.new_tensor((0, 0, 1))
             angle = torch.acos((rays @ axis).amin().clamp(-1, 1)).item() if len(rays) else math.pi
-            found.append((replace(table, table=table.table[pixels].contiguous()), pixels, axis, angle))
+            found.append((replace(whole, table=whole.table[pixels].contiguous()), pixels, axis, angle))
     return tuple(found)

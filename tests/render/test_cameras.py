@@ -142,4 +142,4 @@ def test_what_a_photograph_cannot_show_is_not_visible(projection: str, backend: 
     )
     gaussians = replace(same, means=means, scales=torch.full((4, 3), 0.05), opacities=torch.full((4,), 0.5))
     shown = render(gaussians, cases.view_of(perspective(32, 24, 60.0)), RenderOptions(projection), backend=backend)
-    assert shown.visible.tolist() == [True, False, False, False]
+    assert shown.visible.tolist() == [True, False, False, False] and shown.counters["visible"] == 1
