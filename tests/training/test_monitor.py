@@ -134,7 +134,7 @@ def test_a_void_may_stay_empty_and_what_a_mask_hides_does_not_count():
     photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
     small = torch.zeros(4, 8)
     small[1, :2] = 1
-    made = drawing(photograph * small[..., None])
+    made = drawing(photograph * small[..., None], transmittance=0.5)  # of all pixels the opacity is 0.03
     made.rendering.transmittance[small == 0] = 1
     for target in (Target(photograph * small[..., None], torch.ones(4, 1)), Target(photograph, small)):
         watch = monitor()
