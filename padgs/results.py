@@ -188,7 +188,7 @@ LONGEST_NAME = 255  # letters, as of a file
 FILE_NAME = "result.json"
 CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stress", "train"}  # sections of settings
 # Names that are safe in a path and a command line; `@` separates an experiment from its scale.
-PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
+PLAIN = re.compile(r"[^\W_][\w.-]*(@[\w.-]+)?")
 
 
 class ResultError(ValueError):

@@ -281,9 +281,9 @@ def score_external(
 
     `config` is from `config_of`; `label` names the row in tables, `program` name and version; `runs` is the parent.
     """
-    name = re.sub(r"[^A-Za-z0-9]+", "-", label).strip("-")[:40].lower()
+    name = re.sub(r"[\W_]+", "-", label).strip("-")[:40].lower()
     if not name:
-        raise ValueError(f"--label {label!r} has no letter of A to Z and no digit; name the program")
+        raise ValueError(f"--label {label!r} has no letter and no digit; name the program")
     if len(label) > LONGEST_NAME:
         raise ValueError(f"--label has {len(label)} letters; give at most {LONGEST_NAME}")
     if not scene.test:

@@ -126,7 +126,7 @@ def _refuse_other_world(capture: Capture, points: Tensor) -> None:
         raise DataError(
             "the cameras are around {}, the points around {}: ".format(*places)
             + f"{gap:.3g} apart, {gap / (reach + spread):.2g} times as much as they spread, so not in one world; "
-            "export both in the same coordinates, or set data.points=random"
+            "export both in the same coordinates (Metashape: points in local coordinates), or set data.points=random"
         )
 
 

@@ -32,7 +32,7 @@ _STEREO = "it holds the views of two eyes: cut out the panorama of one eye"
 
 @dataclass(frozen=True)
 class Crop:
-    """Position in pixels of a file's picture in its full panorama."""
+    """Position in pixels of a file's picture in its full panorama, of the size that the file has or is resized to."""
 
     left: int
     top: int
@@ -118,10 +118,12 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
         raise DataError(contradiction)
     if (width, height) == (full_width, full_height):
         return None
-    scale = image.width / width
-    left, top, full_width, full_height = (round(scale * value) for value in (left, top, full_width, full_height))
-    full = (max(full_width, left + image.width), max(full_height, top + image.height))
-    return Crop(left, top, image.width, image.height, *full)
+    # The panorama of a resized picture is 2:1 too; to fit in whole pixels, the picture is stretched by one at most.
+    rows = round(full_height * (image.width + image.height) / (width + height))
+    columns = 2 * rows if full_width == 2 * full_height else round(full_width * rows / full_height)
+    left, right = (round(edge * columns / full_width) for edge in (left, left + width))
+    top, bottom = (round(edge * rows / full_height) for edge in (top, top + height))
+    return Crop(left, top, right - left, bottom - top, columns, rows)
 
 
 def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from padgs.data import image_metadata
 from padgs.data.capture import DataError, listed, refuse_special
+from padgs.data.image_metadata import Crop
 from padgs.files import DAMAGE, ImageError, open_image
 
 EXTENSIONS = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp")
@@ -44,16 +45,17 @@ class ImageFile:
     width: int
     height: int
     digest: str
-    crop: image_metadata.Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
+    crop: Crop | None = None  # where the stored pixels lie in the panorama; None = they are all of it
     converted: bool = False  # whether other programs read other pixels, because the colours are not sRGB
     format: str = ""  # of the content, which the suffix may not tell: JPEG, PNG, ...
 
 
-def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFile:
+def inspect(path: Path, *, mask: bool = False, panorama: bool = True, within: Crop | None = None) -> ImageFile:
     """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
     A DataError says why it is not usable: damage, rotation, several pictures, depth, shape, transparency or colours.
-    Photographs of other cameras, and their masks, have any shape (`panorama` is false).
+    Photographs of other cameras, and their masks, have any shape (`panorama` is false). `within` is the crop of the
+    image of a mask.
     """
     data = read_bytes(path)
     with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
@@ -62,10 +64,13 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True) -> ImageFi
         image_metadata.refuse_several_pictures(image, path)
         mode = image.mode
         _refuse_other_modes(image, data, path, mask)
-        crop = image_metadata.crop_of(image, path) if panorama else None
+        crop = _crop(image, path, within) if panorama else None
         conversion = None if mask else image_metadata.srgb_conversion(image, data, path)
         size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
         may_be_transparent = mode in _ALPHA or "transparency" in image.info
+    if crop is not None and crop.full_width != 2 * crop.full_height:
+        what = f"{path} says that it is a part of a panorama which is not 2:1 ({crop.full_width}x{crop.full_height})"
+        raise DataError(f"{what}; correct FullPanoWidthPixels and FullPanoHeightPixels with exiftool")
     if panorama:
         refuse_other_shapes(*size, path)
     is_cut = _looks_cut(data)
@@ -128,9 +133,12 @@ def refuse_other_shapes(width: int, height: int, path: Path) -> None:
         raise DataError(f"{path} is {width}x{height}, which is not 2:1; {what} ({remedy})")
 
 
-def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
-    """Decode an image to uint8 pixels, [H, W, 3] in sRGB for RGB, [H, W, 1] for L; a DataError if it is damaged."""
-    return _decode(read_bytes(path), path, mode)
+def decode(path: Path, mode: str = "RGB", within: Crop | None = None) -> NDArray[np.uint8]:
+    """Decode an image to uint8 pixels, [H, W, 3] in sRGB for RGB, [H, W, 1] for L; a DataError if it is damaged.
+
+    `within` is as in `inspect`.
+    """
+    return _decode(read_bytes(path), path, mode, within)
 
 
 def save_png(pixels: Tensor, path: Path) -> None:
@@ -139,16 +147,26 @@ def save_png(pixels: Tensor, path: Path) -> None:
     Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
 
 
-def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
+def _crop(image: Image.Image, path: Path, of_image: Crop | None) -> Crop | None:
+    """Return the crop that a file states, else that of the image whose mask it is if they have one size."""
+    crop = image_metadata.crop_of(image, path)
+    if crop is None and of_image is not None:
+        is_same = max(abs(image.width - of_image.width), abs(image.height - of_image.height)) <= 1
+        return of_image if is_same else None
+    return crop
+
+
+def _decode(data: bytes, path: Path, mode: str, within: Crop | None = None) -> NDArray[np.uint8]:
     with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
         image.load()
         transparent = _is_transparent(image)
         convert = image_metadata.srgb_conversion(image, data, path) if mode == "RGB" else None
-        crop, stored = image_metadata.crop_of(image, path), _eight_bit(image).convert(mode)
+        crop, stored = _crop(image, path, within), _eight_bit(image).convert(mode)
         spread = np.ptp(np.asarray(image.convert("RGB")), axis=-1) if mode == "L" and image.mode in _COLOUR else 0
         is_coloured = np.mean(spread > COLOURED) > 1e-3  # whose brightness means nothing; JPEG leaves a few faint ones
         cut = _misses_pixels(image, data, np.asarray(stored))
-        pixels = np.array(stored if convert is None else convert(stored))
+        converted = stored if convert is None else convert(stored)
+        pixels = np.array(converted if crop is None else converted.resize((crop.width, crop.height)))
     if cut:
         raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
     if transparent:

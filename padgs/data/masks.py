@@ -99,35 +99,37 @@ def find_masks(
             _refuse_hidden(weights, f"data.mask={spec} hides ", " of each image; keep more rows")
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
-    inspected: dict[Path, ImageFile] = {}
-    shown: dict[StoredImage | None, float] = {}  # share of the sphere
+    inspected: dict[tuple[Path, Crop | None], ImageFile] = {}
+    shown: dict[StoredImage | None, float] = {}  # share of what the picture shows
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
-        path, fixed = files.get(frame.name), rows.get(height) if frame.lens is None else None
+        path, fixed, pictured = files.get(frame.name), rows.get(height) if frame.lens is None else None, 1.0
         if image.crop is not None:
             fixed = crop_weights(image.crop, width, height) * (1 if fixed is None else fixed)
-            _refuse_hidden(fixed, f"the crop of {image.path} hides ", "; remove that image")
+            pictured = _refuse_hidden(fixed, f"the crop of {image.path} hides ", "; remove that image")
         if path is None:
             masks.append(None if fixed is None else Mask(None, fixed))
             continue
-        if path not in inspected:
-            inspected[path] = inspect(path, mask=True, panorama=frame.lens is None)
-        mask_file = inspected[path]
+        if (key := (path, image.crop)) not in inspected:
+            is_panorama = frame.lens is None
+            inspected[key] = inspect(path, mask=True, panorama=is_panorama, within=image.crop)
+        mask_file = inspected[key]
         is_reduced = frame.lens is None and mask_file.width >= width  # of the view; all panoramas have one shape
         if not is_reduced and (mask_file.width, mask_file.height) not in ((image.width, image.height), (width, height)):
             sizes_differ = f"{mask_file.width}x{mask_file.height} but {image.path.name} is {image.width}x{image.height}"
             rule = "a mask must have the size of its image, or be no smaller than the view"
             raise DataError(f"{path} is {sizes_differ}; {rule} ({width}x{height}, data.width): enlarge it")
-        mask = Mask(StoredImage(path, width, height, store, "L"), fixed, inverted ^ path.name.startswith(INVERTED))
+        stored = StoredImage(path, width, height, store, "L", image.crop)
+        mask = Mask(stored, fixed, inverted ^ path.name.startswith(INVERTED))
         if mask.file not in shown:
             rule = f" of {frame.name}; {_MEANING}"
-            shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule)
+            shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule) / pictured
         masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}{':inverted' * mask.inverted}")
     if shown and (hidden := 1 - median(shown.values())) > MAX_HIDDEN:
         hides = f"the masks hide {hidden:.0%} of the sphere"
         if given == "auto":
-            where = os.path.relpath(next(iter(inspected)), capture.folder).split(os.sep)[0]
-            names = listed(path.name for path in inspected)
+            where = os.path.relpath(next(iter(inspected))[0], capture.folder).split(os.sep)[0]
+            names = listed(path.name for path, _ in inspected)
             raise DataError(f"{hides}, in {names}; {_MEANING}; if that is meant, set data.mask={where}")
         notes.append(f"{hides}, as data.mask={given} says")
     return masks, digests, notes
@@ -174,7 +176,8 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         return named, f"masks: those that {capture.format} names, for {len(named)} of {len(capture.frames)} views"
     if given is None:
         folder = capture.folder
-        given = first_of(folder, SCENE_MASKS) or first_of(folder, MASK_FOLDERS, Path.is_dir) or capture.image_folder
+        folders = [first_of(parent, MASK_FOLDERS, Path.is_dir) for parent in (folder, capture.image_folder)]
+        given = first_of(folder, SCENE_MASKS) or folders[0] or folders[1] or capture.image_folder
     if given.is_file():
         panoramas = [frame.name for frame in capture.frames if frame.lens is None]
         which = "every view" if len(panoramas) == len(capture.frames) else "every panorama"
@@ -192,14 +195,29 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
 
 
 def masks_beside(name: str) -> list[str]:
-    """Return the names that a mask may have beside its image, or in a folder of masks.
+    """Return the names that a mask may have beside its image, or in a folder of masks there.
 
-    >>> masks_beside("hall/a.jpg")[::9]
-    ['hall/a.jpg.png', 'hall/a_mask.bmp']
+    >>> masks_beside("hall/a.jpg")[:3]
+    ['hall/a.jpg.png', 'hall/a.jpg.mask.png', 'hall/dynamic_mask_a.png']
+    >>> masks_beside("hall/a.jpg")[-1]
+    'hall/mask/a.bmp'
     """
-    stem = PurePosixPath(name).with_suffix("")
-    names = [f"{name}.png", *(f"{stem}_mask{extension}" for extension in EXTENSIONS)]
-    return [*names, str(stem.with_name(f"{INVERTED}{stem.name}.png"))]
+    file, stem = (path := PurePosixPath(name)).name, path.stem
+    stems = [f"{stem}_mask", f"{stem}.mask", f"{stem}-mask", f"mask_{stem}", f"mask-{stem}"]
+    names = [f"{file}.png", f"{file}.mask.png", f"{INVERTED}{stem}.png"]
+    names += [f"{named}{extension}" for named in stems for extension in EXTENSIONS]
+    inside = [*names, *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
+    folder = name.removesuffix(file)
+    return [folder + end for end in [*names, *(f"{place}/{end}" for place in MASK_FOLDERS for end in inside)]]
+
+
+def is_of_masks(name: str) -> bool:
+    """Return whether a file lies in a folder that is named for masks, by its path relative to that of the images.
+
+    >>> is_of_masks("hall/Masks/a.png"), is_of_masks("sky_masks/a.png"), is_of_masks("hall/mask.png")
+    (True, True, False)
+    """
+    return any(re.search(r"(?i)(?<![a-z])masks?(?![a-z])", part) for part in PurePosixPath(name).parts[:-1])
 
 
 def _in_folder(folder: Path, name: str, beside: bool, listings: dict[Path, dict[str, Path]]) -> Path | None:

@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from padgs.data.image_metadata import Crop
 from padgs.data.images import decode
 from padgs.files import atomic_path
 
@@ -167,6 +168,7 @@ class StoredImage:
     height: int
     store: ImageStore
     mode: str = "RGB"  # RGB, or L for masks
+    within: Crop | None = None  # of a mask, as in `padgs.data.images.inspect`
 
     def __call__(self) -> Tensor:
         """Return pixels [H, W, 3] uint8 (L: [H, W, 1]); shared, do not modify."""
@@ -178,11 +180,12 @@ class StoredImage:
 
     def decode(self) -> Tensor:
         """Read, decode and reduce without the cache."""
-        return torch.from_numpy(area_resize(decode(self.path, self.mode), self.width, self.height))
+        return torch.from_numpy(area_resize(decode(self.path, self.mode, self.within), self.width, self.height))
 
     def file(self, folder: Path) -> tuple[Path, tuple[int, int, int]]:
         """Return the file of the pixels in a cache on disk, named by the image file, its time and the size."""
         status = os.stat(self.path)
         text = f"{self.path.resolve()}|{status.st_size}|{status.st_mtime_ns}|{self.mode}|{self.width}x{self.height}"
+        text += "" if self.within is None else f"|{self.within}"
         name = f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.raw"
         return folder / name, (self.height, self.width, 3 if self.mode == "RGB" else 1)

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unicodedata import normalize
 
 import torch
 from filelock import FileLock, Timeout
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 PROGRESS = "progress"  # key of `Progress` in a checkpoint
 HASH_DIGITS = 10
+LONGEST_WORD = 48  # letters of a scene or variant in a folder's name, which may have 255 bytes
 LOCK, OWNER = ".lock", ".owner.json"
 
 
@@ -237,11 +239,13 @@ def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str 
     >>> values = {"data": {"path": "/x"}, "method": {"name": "padgs"}, "variant": "no m", "seed": 0}
     >>> run_id(values, "bar", "f00d")
     'bar_padgs_no-m_37d2ecb9bc'
+    >>> run_id(values, "客厅 1", "f00d")
+    '客厅-1_padgs_no-m_37d2ecb9bc'
     """
     digest = hashlib.sha256(f"{config_hash(values)}|{fingerprint}".encode()).hexdigest()
     stress = "-".join(map(str, values.get("stress", {}).values()))
     words = [scene, preset or values["method"]["name"], values["variant"], stress]
-    readable = [re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip("-.") for word in words]
+    readable = [re.sub(r"(?:[^\w.-]|_)+", "-", normalize("NFC", word))[:LONGEST_WORD].strip("-.") for word in words]
     return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])
 
 

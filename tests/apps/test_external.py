@@ -260,7 +260,7 @@ def test_wrong_input_is_refused(run, splats, tmp_path):
         (("score", splats, "--data", run, "--rays", "x"), "unknown --rays 'x'; known: exact, ewa"),
         (("score", splats, "--data", run, "--width", "64"), "leave out --width"),
         (("score", splats, "--data", tmp_path / "gone"), "gone"),
-        (("score", splats, "--data", run, "--label", "…", "--to", tmp_path), "has no letter of A to Z"),
+        (("score", splats, "--data", run, "--label", "…", "--to", tmp_path), "has no letter and no digit"),
         (
             ("score", splats, "--data", run, "--label", 256 * "a", "--to", tmp_path),
             "--label has 256 letters; give at most",

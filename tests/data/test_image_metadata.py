@@ -11,6 +11,7 @@ from PIL import Image, ImageCms
 from support.fixtures import World, write_colmap_text
 
 from padgs.data import DataError, load
+from padgs.data.image_metadata import _CROP_PROPERTIES
 from padgs.data.images import decode, inspect
 from padgs.data.prepare.sources import find_source
 from padgs.reports.store import split_image
@@ -98,7 +99,7 @@ def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_
         ({"FullPanoWidthPixels": "wide"}, "contradicts itself"),
         ({"CroppedAreaImageWidthPixels": 0}, "contradicts itself"),
         ({"CroppedAreaImageHeightPixels": 20}, "contradicts itself"),
-        ({"FullPanoHeightPixels": 79}, "is 160x79, which is not 2:1"),
+        ({"FullPanoHeightPixels": 79}, r"says that it is a part of a panorama which is not 2:1 \(160x79\); correct"),
         ({"StereoMode": "top-bottom"}, r"says that it is stereo \(top-bottom\)"),
         ({"Orientation": 6}, "carries XMP orientation 6"),
     ],
@@ -107,6 +108,41 @@ def test_other_projections_contradictions_and_stereo_are_refused(changes, messag
     PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**GPANO | changes))
     with pytest.raises(DataError, match=f"a.jpg {message}"):
         inspect(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("width", [*range(399, 412), 2000])
+@pytest.mark.parametrize("box", [(0, 510, 4000, 1000), (1210, 430, 1500, 1130)])
+def test_a_resized_part_lies_where_it_was(box, width, tmp_path):
+    left, top, right, bottom = box[0], box[1], box[0] + box[2], box[1] + box[3]
+    stated = (4000, 2000, box[2], box[3], left, top)
+    packet = xmp(**dict(zip(_CROP_PROPERTIES, stated, strict=True)))
+    Image.new("RGB", (width, round(width * box[3] / box[2])), "white").save(tmp_path / "a.jpg", xmp=packet)
+    found, pixels = inspect(tmp_path / "a.jpg"), decode(tmp_path / "a.jpg")
+    assert found.width == 2 * found.height and pixels.shape == (found.height, found.width, 3)
+    scale = found.width / 4000
+    assert scale == pytest.approx(width / box[2], abs=1.5 / 2000)
+    rows, columns = np.nonzero(pixels[..., 0] > 128)
+    edges = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+    assert edges == pytest.approx([scale * edge for edge in (left, right, top, bottom)], abs=0.51)
+
+
+@pytest.mark.parametrize("part", [(16, 8, 32, 16), (16, 4, 20, 16)])
+def test_a_mask_of_the_size_of_a_part_lies_where_it_lies(part, world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    name = world.names[0]
+    left, top, width, height = part
+    picture = Image.fromarray(world.images[0]).crop((left, top, left + width, top + height))
+    sizes = zip(_CROP_PROPERTIES, (64, 32, width, height, left, top), strict=True)
+    with_chunk(tmp_path / "images" / f"{name}.png", picture, png_chunk(b"iTXt", XMP + xmp(**dict(sizes))))
+    mask = np.full((height, width), 255, np.uint8)
+    mask[: height // 4] = 0
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / f"{name}.png")
+    scene = load(tmp_path, disk_cache="off")
+    (weights,) = (view.mask() for view in (*scene.train, *scene.test) if view.name == name)
+    expected = np.zeros((32, 64))
+    expected[top + height // 4 : top + height, left : left + width] = 1
+    assert np.array_equal(weights.numpy(), expected)
 
 
 def test_what_a_part_does_not_show_is_masked(world: World, tmp_path: Path) -> None:

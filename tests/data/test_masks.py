@@ -55,6 +55,9 @@ def test_one_mask_for_the_scene(name: str, folder: Path) -> None:
         "images/pano_00_mask.png",
         "images/pano_00.png.png",
         "images/dynamic_mask_pano_00.png",
+        "images/mask_pano_00.png",
+        "images/pano_00.png.mask.png",
+        *(f"images/{folder}/{name}" for folder in ("masks", "mask") for name in ("pano_00.png", "pano_00_mask.jpg")),
     ],
 )
 def test_habits_of_other_programs(file: str, folder: Path) -> None:
@@ -64,7 +67,7 @@ def test_habits_of_other_programs(file: str, folder: Path) -> None:
     hidden = 20 if "dynamic" in file else 12  # white is ignored there
     torch.testing.assert_close(views["pano_00"].mask().sum(), torch.tensor((32.0 - hidden) * 64), atol=9, rtol=0)
     assert views["pano_02"].mask() is None and len(views) == 6
-    assert any(note.startswith(f"masks: {file.split('/')[0]}/ for 1 of 6 views") for note in scene.notes)
+    assert any(note.startswith(f"masks: {Path(file).parent.name}/ for 1 of 6 views") for note in scene.notes)
     assert not any("no pose" in note for note in scene.notes)
 
 

@@ -58,7 +58,7 @@ def test_images_are_decoded_once_where_the_disk_keeps_them(files: list[Path], tm
     os.utime(files[0], (1, 1))  # it was written anew
     StoredImage(files[1], 32, 16, first).file(folder)[0].write_bytes(b"cut")
     decoded = []
-    monkeypatch.setattr(store_module, "decode", lambda path, mode: decoded.append(path) or decode(path, mode))
+    monkeypatch.setattr(store_module, "decode", lambda path, *how: decoded.append(path) or decode(path, *how))
     for path in files:
         assert torch.equal(StoredImage(path, 32, 16, later)(), _expected(path))
     assert decoded == files[:2]

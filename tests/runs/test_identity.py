@@ -18,7 +18,14 @@ def name(*overrides: str, scene: str = "room", fingerprint: str = "f00d") -> str
 def test_it_reads_like_what_it_is():
     assert name("+ablation=dagd").startswith("room_padgs_dagd_")
     assert name().startswith("room_padgs_")
-    assert "/" not in name(scene="../house 3/ü")
+    assert name(scene="../house 3/u\u0308_1").startswith("house-3-ü-1_padgs_")
+
+
+@pytest.mark.parametrize("scene", ["客厅", "Квартира 2", "λ", "a" * 200, "客" * 200])
+def test_scenes_in_all_languages_have_readable_names_of_a_length_that_files_may_have(scene):
+    found = name("variant=" + 70 * "x", scene=scene)
+    assert found.startswith(scene[:40].replace(" ", "-"))
+    assert len(found.encode()) < 255 and results.PLAIN.fullmatch(found)
 
 
 @pytest.mark.parametrize(

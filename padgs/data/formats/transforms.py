@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, UnknownLens, first_of
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed
 from padgs.data.cloud import first_ply, read_ply
 from padgs.data.depths import HOW
 from padgs.data.formats import detect
@@ -28,10 +28,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     """
     file = file_in(path, FILE)
     folder = file.parent
-    if file.exists():
-        metas = {"": read_json(file)}
-    else:
-        metas = {side: read_json(part) for side, names in SIDES.items() if (part := first_of(folder, names))}
+    sides = {side: part for side, names in SIDES.items() if (part := first_of(folder, names))}
+    metas = {"": read_json(file)} if file.exists() else {side: read_json(part) for side, part in sides.items()}
     if not metas:
         raise DataError(f"{folder} holds neither {FILE} nor {SIDES['train'][0]} and {SIDES['test'][0]}")
     root = folder if options.images is None else folder / options.images
@@ -47,6 +45,13 @@ def read(path: Path, options: DataOptions) -> Capture:
     for side in SIDES:
         if "" in metas and (names := first.get(f"{side}_filenames")) and names.entries():
             split[side] = tuple(_name(name) for name in names.entries())
+    notes: tuple[str, ...] = ()
+    if "" in metas and path != file and sides:  # another program's split of these frames?
+        pair = {side: tuple(_name(frame["file_path"]) for frame in _frames(part)) for side, part in sides.items()}
+        if split or not set().union(*pair.values()) <= {frame.name for frame in frames}:
+            notes = (f"not used: {listed(part.name for part in sides.values())}; {FILE} has the views",)
+        else:
+            split = pair
     prefix = _shared_folder([frame.name for frame in frames])
     if prefix:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
@@ -56,7 +61,6 @@ def read(path: Path, options: DataOptions) -> Capture:
     if options.points == "auto":  # else a missing or damaged file does not matter
         cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
     meant = mask.text() if mask else "auto"  # as `padgs split` states it
-    notes: tuple[str, ...] = ()
     if len(metas) > 1 and len(unused := [file for name in SIDES["test"] if (file := first_of(folder, (name,)))]) > 1:
         notes = (f"{unused[1].name} is not used: {unused[0].name} has the test views",)
     if any(frame.get("depth_file_path") for meta in metas.values() for frame in meta["frames"].entries()):
@@ -88,6 +92,10 @@ def _frame(meta: Json, frame: Json, folder: Path, root: Path, *, reads_masks: bo
     if share.ndim or not 0 < share <= 1:
         raise DataError(f"{stated.where} is {stated.value}; it must be a number above 0 and at most 1, for each pass")
     return Frame(name, root / name, pose, width, height, mask and mask.path_in(folder), share=share.item(), lens=lens)
+
+
+def _frames(path: Path) -> list[Json]:
+    return read_json(path)["frames"].entries()
 
 
 def _name(path: Json) -> str:

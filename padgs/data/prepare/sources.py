@@ -17,7 +17,7 @@ from padgs.data.assemble import file_names, image_folder, image_names, refuse_cl
 from padgs.data.capture import Capture, DataError, Frame, Progress, listed, silent
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
-from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks
+from padgs.data.masks import SCENE_MASKS, Mask, find_masks, is_of_masks
 from padgs.data.scans import optional_module
 from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
@@ -146,7 +146,7 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{path} {_NOT_STITCHED}")
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
-    folder = image_folder(path, None)
+    folder = panorama_folder(path)
     names = [check_name(name, str(folder)) for name in panoramas(folder)]
     others, ways_out = _others(folder)
     if len(names) < 2:
@@ -164,9 +164,11 @@ def find_source(path: Path, mask: str) -> Source:
     notes = [*image_files.notes_on(list(images.values())), *mask_notes]
     if others:
         notes.append(f"left out: {others}{ways_out}")
-    scene_masks = [name for name in image_names(folder) if PurePosixPath(name).name.lower() in SCENE_MASKS]
-    if unused := [name for name in scene_masks if mask == "auto" and (folder / name).parent != expected]:
-        notes.append(f"not used: {listed(unused)}; a mask of all panoramas must be in {expected}")
+    read = {found.file.path for found in masks if found is not None and found.file is not None}
+    unused = [name for name in image_names(folder) if name not in images and folder / name not in read]
+    if mask == "auto" and (unused := [name for name in unused if PurePosixPath(name).name.lower() != OVERLAY]):
+        rule = f"a mask of all panoramas must be in {expected}, others in masks/ with the names of their panoramas"
+        notes.append(f"not used: {listed(unused)}; {rule}")
     identity = "".join(f"{name}|{image.digest}|" for name, image in images.items()) + repr(digests)
     used = {name: found for name, found in zip(names, masks, strict=True) if found is not None}
     return Source(images, used, hashlib.sha256(identity.encode()).hexdigest(), tuple(notes))
@@ -175,8 +177,13 @@ def find_source(path: Path, mask: str) -> Source:
 def panoramas(folder: Path) -> list[str]:
     """Return the panoramas below a folder, relative to it and sorted, without masks."""
     others = (*SCENE_MASKS, OVERLAY)
-    names = [name for name in image_names(folder) if PurePosixPath(name).parts[0].lower() not in MASK_FOLDERS]
+    names = [name for name in image_names(folder) if not is_of_masks(name)]
     return [name for name in names if PurePosixPath(name).name.lower() not in others]
+
+
+def panorama_folder(path: Path) -> Path:
+    """Return the folder of the panoramas: the given one if there are images in it, else that of its images."""
+    return path if any("/" not in name for name in panoramas(path)) else image_folder(path, None)
 
 
 def _others(folder: Path) -> tuple[str, str]:
@@ -190,4 +197,4 @@ def _others(folder: Path) -> tuple[str, str]:
 
 def mask_folder(path: Path) -> Path:
     """Return the folder that is searched for masks: that of the panoramas, or its parent if it is called images."""
-    return path.parent if path.name.lower() == "images" and image_folder(path, None) == path else path
+    return path.parent if path.name.lower() == "images" and panorama_folder(path) == path else path

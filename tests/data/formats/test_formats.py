@@ -105,7 +105,18 @@ def test_pairs_of_transforms_files(world: World, tmp_path: Path) -> None:
         frames = [{**frame, "file_path": "./" + frame["file_path"].removesuffix(".png")} for frame in frames]
         part = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
         (tmp_path / "scene" / f"transforms_{side}.json").write_text(json.dumps(part))
-    (tmp_path / "scene" / "transforms.json").unlink()
+    for path in (tmp_path / "scene").glob("*.txt"):
+        path.unlink()
+    file = tmp_path / "scene" / "transforms.json"
+    bare = {**whole, "frames": [{**frame, "file_path": "./" + frame["file_path"][:-4]} for frame in whole["frames"]]}
+    bare = {key: value for key, value in bare.items() if not key.endswith("_filenames")}
+    file.write_text(json.dumps(bare))
+    assert [view.name for view in load(tmp_path / "scene").test] == list(world.test)
+    file.write_text(json.dumps({**bare, "test_filenames": ["images/pano_00"]}))
+    both = load(tmp_path / "scene")
+    assert [view.name for view in both.test] == ["pano_00"]
+    assert "not used: transforms_train.json, transforms_test.json; transforms.json has the views" in both.notes
+    file.unlink()
     scene = load(tmp_path / "scene")
     assert [view.name for view in scene.test] == list(world.test) and len(scene.points) == len(world.points)
 

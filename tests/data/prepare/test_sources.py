@@ -59,7 +59,38 @@ def test_masks_overlays_and_renders_are_not_panoramas(tmp_path):
     save(tmp_path / "kitchen" / "mask.png", 255)
     source = find_source(tmp_path, "auto")
     assert list(source.images) == ["a.png", "b.png"]
-    assert source.notes[1:] == (f"not used: kitchen/mask.png; a mask of all panoramas must be in {tmp_path}",)
+    rule = f"a mask of all panoramas must be in {tmp_path}, others in masks/ with the names of their panoramas"
+    assert source.notes[1:] == (f"not used: kitchen/mask.png; {rule}",)
+
+
+@pytest.mark.parametrize(
+    "mask", ["masks/hall/a.png", "hall/masks/a.png", "hall/masks/a.png.png", "hall/mask_a.png", "hall/a-mask.png"]
+)
+@pytest.mark.parametrize("top", ["", "images"])
+def test_masks_of_panoramas_in_folders(mask, top, tmp_path):
+    folder = tmp_path / top
+    for name in ("hall/a.png", "hall/b.png", "attic/a.png"):
+        save(folder / name)
+    (folder / mask).parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.repeat(np.uint8([0, 255]), 16 * 16).reshape(16, 32)).save(folder / mask)
+    source = find_source(tmp_path, "auto")
+    assert list(source.images) == ["attic/a.png", "hall/a.png", "hall/b.png"]
+    assert list(source.masks) == ["hall/a.png"]
+    assert source.masks["hall/a.png"]().mean(dim=1).tolist() == [0.0] * 8 + [1.0] * 8
+
+
+def test_masks_that_belong_to_no_panorama_are_noted(tmp_path):
+    for name in ("hall/a.png", "hall/b.png", "hall/Sky Masks/1.png", "hall/masks/c.png"):
+        save(tmp_path / name)
+    source = find_source(tmp_path, "auto")
+    assert list(source.images) == ["hall/a.png", "hall/b.png"] and not source.masks
+    assert source.notes[-1].startswith("not used: hall/Sky Masks/1.png, hall/masks/c.png; a mask of all panoramas must")
+
+
+def test_the_named_folder_is_taken_if_it_holds_panoramas_itself(tmp_path):
+    for name in ("a.png", "b.png", "rgb/c.png", "images/d.png"):
+        save(tmp_path / name)
+    assert list(find_source(tmp_path, "auto").images) == ["a.png", "b.png", "images/d.png", "rgb/c.png"]
 
 
 def test_links_and_names_in_any_case_are_followed(tmp_path):
