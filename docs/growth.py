@@ -2,9 +2,9 @@
 
     OMP_NUM_THREADS=1 python docs/growth.py
 
-writes the table in docs/notes/growth.md in some minutes on an idle machine; `--quick` prints small sizes and writes
-nothing. Gaussians lie on the walls of a cube, as large as their distance from the next, and the panoramas are noise;
-every size has a process of its own, whose memory is counted above that of the smallest size.
+writes the table in docs/notes/growth.md in some minutes on an idle machine. Gaussians lie on the walls of a cube, as
+large as their distance from the next, and the panoramas are noise; every size has a process of its own, whose memory is
+counted above that of the smallest size.
 """
 
 import json
@@ -19,7 +19,6 @@ import numpy as np
 GAUSSIANS = (25_000, 50_000, 100_000, 200_000, 400_000, 800_000)  # at 1024x512
 WIDTHS = (256, 512, 1024, 2048)  # with 100 000 Gaussians
 WIDTH, COUNT, TINY = 1024, 100_000, (64, 1000)
-QUICK = ((10_000, 20_000, 40_000), (256, 512), 256, 10_000)
 WARM_UP, ITERATIONS, VIEWS = 3, 10, 4
 FOLDER = Path(__file__).resolve().parent
 
@@ -58,11 +57,10 @@ def measured(width: int, count: int) -> tuple[float, int]:
     return tuple(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
 
 
-def series(quick: bool) -> dict[str, list[tuple[int, float, float]]]:
+def series() -> dict[str, list[tuple[int, float, float]]]:
     """Return for Gaussians and pixels: (number, milliseconds, MB above the smallest size)."""
-    counts, widths, width, count = QUICK if quick else (GAUSSIANS, WIDTHS, WIDTH, COUNT)
     least = measured(*TINY)[1]
-    sizes = {"Gaussians": [(n, width, n) for n in counts], "pixels": [(w * w // 2, w, count) for w in widths]}
+    sizes = {"Gaussians": [(n, WIDTH, n) for n in GAUSSIANS], "pixels": [(w * w // 2, w, COUNT) for w in WIDTHS]}
     rows = {kind: [(n, *measured(w, c)) for n, w, c in chosen] for kind, chosen in sizes.items()}
     return {kind: [(n, 1e3 * seconds, (b - least) / 1e6) for n, seconds, b in found] for kind, found in rows.items()}
 
@@ -74,19 +72,15 @@ def exponent(found: list[tuple[int, float, float]], column: int) -> float:
 
 
 def main() -> None:
-    """Measure, and print or write the table."""
+    """Measure, and write the table."""
     if "--one" in sys.argv:
         print(json.dumps(measure(*map(int, sys.argv[-2:]))))
         return
-    quick = "--quick" in sys.argv
-    rows = series(quick)
     lines = ["| growing | number | CPU ms per iteration | memory, MB |", "|---|---|---|---|"]
-    for kind, found in rows.items():
+    for kind, found in series().items():
         lines += [f"| {kind} | {number:,} | {ms:.0f} | {mb:.0f} |" for number, ms, mb in found]
         lines.append(f"| {kind} | exponent | {exponent(found, 1):.2f} | {exponent(found, 2):.2f} |")
     print(table := "\n".join(lines))
-    if quick:
-        return
     page = FOLDER / "notes" / "growth.md"
     between = re.compile(r"(<!-- growth -->\n).*(<!-- end -->)", re.DOTALL)
     page.write_text(between.sub(lambda m: f"{m[1]}{table}\n{m[2]}", page.read_text()))

@@ -132,12 +132,18 @@ def write_ply(path: Path, cloud: Cloud) -> None:
         PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(draft))
 
 
-def joined(clouds: Sequence[Cloud]) -> Cloud:
-    """Return the points of several clouds as one; it has colours if all clouds with points have them."""
-    clouds = [cloud for cloud in clouds if len(cloud.points)]
-    colors = [cloud.colors for cloud in clouds if cloud.colors is not None]
-    points = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(cloud.points for cloud in clouds)])
-    return Cloud(points, torch.cat(colors) if colors and len(colors) == len(clouds) else None)
+def joined(clouds: Sequence[Cloud]) -> tuple[Cloud, tuple[str, ...]]:
+    """Return the points of several clouds as one, and notes; if some clouds have colours, without those of the others.
+
+    Orientations are recognised by colours, which black ones of scanners without a camera, or grey, would hide.
+    """
+    coloured = [cloud for cloud in clouds if cloud.colors is not None and cloud.colors.any()]
+    used = coloured or clouds
+    points = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(cloud.points for cloud in used)])
+    colors = [cloud.colors for cloud in coloured if cloud.colors is not None]
+    rest = sum(len(cloud.points) for cloud in clouds) - len(points)
+    notes = (f"points: {rest} of scans without colours are left out, as others have colours",) if rest else ()
+    return Cloud(points, torch.cat(colors) if colors else None), notes
 
 
 def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:

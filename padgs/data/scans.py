@@ -94,7 +94,9 @@ def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:
     with open_e57(path) as file:
         headers = [file.get_header(index) for index in range(file.scan_count)]
         step = -(-sum(header.point_count for header in headers) // MOST_POINTS) or 1
-        return _thinned(path, joined([_scan(file, header, step) for header in headers]), step)
+        cloud, notes = joined([_scan(file, header, step) for header in headers])
+    cloud, thinned = _thinned(path, cloud, step)
+    return cloud, (*notes, *thinned)
 
 
 @contextmanager

@@ -77,7 +77,11 @@ def run(
     words = Console(quiet=True) if brief else console
     introduce(config, scene, store.path, words)
     result = store.result()
-    if result is not None and not _is_incomplete(config, scene, result):
+    if (
+        result is not None
+        and not (_is_retried(config, result) or _unscored(config, scene, result))
+        and results.joined(result.experiments, config.labels.experiments) == result.experiments
+    ):
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
         if (code := distribution(config.method)) and not result.code_version.endswith(code):
             advice += f"; it was trained by other code of the method ({result.code_version}): delete it to train again"
@@ -287,12 +291,6 @@ def judge(result: Result, scene: Scene, iterations: int) -> Result:
     elif thickness is not None and thickness < MIN_THICKNESS:
         reason = f"surfaces are {thickness:.2%} as thick as the true ones, less than {MIN_THICKNESS:.0%}"
     return replace(result, status="degenerate", reason=reason) if reason else result
-
-
-def _is_incomplete(config: RunConfig, scene: Scene, result: Result) -> bool:
-    """Return whether a finished run is to be trained again, lacks scores, or does not name the experiments of here."""
-    labels = results.joined(result.experiments, config.labels.experiments)
-    return _is_retried(config, result) or bool(_unscored(config, scene, result)) or labels != result.experiments
 
 
 def _is_retried(config: RunConfig, result: Result) -> bool:

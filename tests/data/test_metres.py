@@ -145,6 +145,14 @@ def test_local_metres_agree_with_the_ellipsoid():
     assert (places[1, 0] - places[0, 0]).item() == pytest.approx(1113.20, abs=0.01)
 
 
+@pytest.mark.parametrize("first", [179.9999, -179.9999])
+def test_the_180th_meridian_is_no_gap(first: float):
+    (_, longitude, _), places = local_metres([(0.0, first, 0.0), (0.0, -first, 0.0), (0.0, 179.9999, 0.0)])
+    east = places[:, 0] * (1 if first > 0 else -1)
+    assert (east[1] - east[0]).item() == pytest.approx(22.264, abs=0.001)
+    assert 179.9999 < longitude < 180
+
+
 def test_convert_writes_metres_and_says_so(world: World, tmp_path: Path):
     def run(*arguments: object):
         return CliRunner().invoke(app, ["convert", str(tmp_path / "a"), str(tmp_path / "b"), *map(str, arguments)])

@@ -59,6 +59,8 @@ def detect(path: Path) -> tuple[str, str]:
             "data_views.json with data_extrinsics.json. Panoramas without poses: run `padgs prepare IMAGES OUT` first"
         )
     name, *others = found
+    if name == "navvis":  # whose points may be in an E57 file
+        others = [other for other in others if other != "e57"]
     reason = f"format: {name}, detected by {found[name]}"
     if others:
         reason += f" ({OTHERS}: {', '.join(found[other] for other in others)}; set data.format to choose)"

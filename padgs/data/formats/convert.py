@@ -67,6 +67,9 @@ def convert(
             partial.rename(destination)
     except OSError as error:
         raise DataError(f"cannot write {destination} ({error.strerror or error}); nothing was written") from error
+    if not scene.test:
+        note = f"split: no list states that every view is a training view; train on {destination} with data.split=all"
+        scene = replace(scene, notes=(*scene.notes, note))
     return scene
 
 

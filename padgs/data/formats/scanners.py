@@ -5,6 +5,7 @@ files hold panoramas, poses and points.
 """
 
 import csv
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,8 @@ def read_navvis(path: Path, options: DataOptions) -> Capture:
     names = [name.strip() for name in head.split(mark)]
     if absent := [name for name in ("filename", *COLUMNS) if name not in names]:
         raise DataError(f"{file}, line {lines[0][0]} lacks the columns {listed(absent, 8)}; export the poses again")
-    folder = path if path.is_dir() else file.parent.parent if file.parent.name == "pano" else file.parent
+    folder = file.absolute().parent
+    folder = folder.parent if folder.name == "pano" else folder
     images = image_folder(folder, options.images) if options.images else image_folder(file.parent, None)
     frames = []
     for number, line in lines[1:]:
@@ -94,7 +96,8 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
     notes.append(f"images: {len(frames)} panoramas of {named}, written beside it")
     if edited:
         notes.append(f"images: {listed(edited)} differ from those of {named}, and are used because they are newer")
-    cloud = joined(clouds)
+    cloud, more = joined(clouds)
+    notes += more
     cloud = cloud if len(cloud.points) else None
     return Capture("e57", root, folder, tuple(frames), cloud, notes=tuple(notes), readings=_turned())
 
@@ -107,8 +110,9 @@ def _named_images(opened: Any) -> Iterator[tuple[str, Any]]:
         image = entries[index]
         stated = image["name"].value() if image.isDefined("name") else ""
         name = "".join(c if c.isalnum() or c in " -_." else "_" for c in stated).strip(" .")[:100] or f"{index:05d}"
-        name = f"{name}_{index:05d}" if name.casefold() in taken else name
-        taken.add(name.casefold())
+        key = re.sub(r"\.(jpe?g|png)$", "", name.casefold())
+        name = f"{name}_{index:05d}" if key in taken else name
+        taken.add(key)
         yield name, image
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 
+from padgs.data.assemble import IMAGE_FOLDERS
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed
 from padgs.data.cloud import first_ply, read_ply
 from padgs.data.depths import HOW
@@ -52,7 +53,10 @@ def read(path: Path, options: DataOptions) -> Capture:
             notes = (f"not used: {listed(part.name for part in sides.values())}; {FILE} has the views",)
         else:
             split = pair
-    prefix = _shared_folder([frame.name for frame in frames])
+    folders = [str(PurePosixPath(frame.name).parent) for frame in frames if is_inside(frame.name)]
+    prefix = commonpath(folders) if folders and len(folders) == len(frames) else ""
+    if (top := prefix.partition("/")[0]).lower() in IMAGE_FOLDERS:  # masks and depth maps have the folders below it
+        prefix = top
     if prefix:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
@@ -100,9 +104,3 @@ def _frames(path: Path) -> list[Json]:
 
 def _name(path: Json) -> str:
     return str(PurePosixPath(path.name().replace("\\", "/")))
-
-
-def _shared_folder(names: list[str]) -> str:
-    """Return the folder that holds all images, "" if there is none: "images" for images/a.jpg, images/hall/b.jpg."""
-    folders = [str(PurePosixPath(name).parent) for name in names]
-    return commonpath(folders) if folders and all(map(is_inside, names)) else ""

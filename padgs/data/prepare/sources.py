@@ -56,8 +56,9 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     written = 0
     for written, frame in enumerate(_sharpest(video, per_second, progress), 1):
         Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
-    if written == 0:
-        raise DataError(f"{video} holds no frames")
+    if written < 2:
+        what = f"{video} gives {written} frames at {per_second:g} a second; structure from motion needs at least two"
+        raise DataError(f"{what}: take more a second (`--per-second`), or a longer video")
     return written
 
 

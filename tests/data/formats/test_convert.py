@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.fixtures import WRITERS, World, write_cloud
+from support.fixtures import WRITERS, World, write_cloud, write_colmap_text
 
 from padgs.cli.convert import FORMATS
 from padgs.data import DataError, DataOptions, load, read
@@ -119,6 +119,34 @@ def test_nested_images(world: World, tmp_path: Path) -> None:
     views = {view.name: view.mask() for view in (*scene.train, *scene.test)}
     assert {"eins/pano_00", "zwei ü/pano_01"} <= views.keys()
     assert [name for name, mask in views.items() if mask is not None] == ["zwei ü/pano_01"]
+
+
+def test_images_in_one_subfolder_keep_names_masks_and_depth(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path / "a")
+    for name in world.names:
+        (tmp_path / "a" / "images" / "pano").mkdir(exist_ok=True)
+        (tmp_path / "a" / "images" / f"{name}.png").rename(tmp_path / "a" / "images" / "pano" / f"{name}.png")
+    model = tmp_path / "a" / "sparse" / "0" / "images.txt"
+    model.write_text(model.read_text().replace("pano_", "pano/pano_"))
+    for kind in ("masks", "depths"):
+        (tmp_path / "a" / kind / "pano").mkdir(parents=True)
+    Image.new("L", (64, 32), 100).save(tmp_path / "a" / "masks" / "pano" / "pano_01.png")
+    np.save(tmp_path / "a" / "depths" / "pano" / "pano_01.npy", np.full((32, 64), 2.0, np.float32))
+    (tmp_path / "a" / "depths" / "depth.json").write_text('{"measure": "ray", "unit": 1}')
+    for to in ("transforms", "colmap", "openmvg", "opensfm"):
+        convert(tmp_path / "a", tmp_path / to, to, options=DataOptions(split="every"))
+        scene = load(tmp_path / to, split="every")
+        views = {view.name: view for view in (*scene.train, *scene.test)}
+        assert [*views] == [f"pano/{name}" for name in (*world.names[1:], world.names[0])], to
+        assert [name for name, view in views.items() if view.mask() is not None] == ["pano/pano_01"], to
+        assert [name for name, view in views.items() if view.load_depth is not None] == ["pano/pano_01"], to
+
+
+def test_a_capture_that_is_all_for_training_says_so(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path / "a")
+    scene = convert(tmp_path / "a", tmp_path / "b", "colmap", options=DataOptions(split="all"))
+    assert any("train on" in note and note.endswith("with data.split=all") for note in scene.notes)
+    assert len(load(tmp_path / "b", split="all").train) == len(world.names)
 
 
 def test_a_full_disk_leaves_no_files(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

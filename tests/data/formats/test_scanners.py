@@ -17,7 +17,7 @@ from support.fixtures import PANORAMA, World, quaternion, write_images, write_na
 from padgs.data import DataError, load, read
 from padgs.data import scans as scans_module
 from padgs.data.capture import Cloud
-from padgs.data.cloud import read_cloud, write_ply
+from padgs.data.cloud import joined, read_cloud, write_ply
 
 
 @pytest.mark.parametrize(("turn", "along"), [(0, "x"), (90, "y"), (180, "-x"), (-90, "-y")])
@@ -28,6 +28,33 @@ def test_turned_images_of_navvis_are_recognised_by_colours(turn: float, along: s
     for view in scene.train:
         rotation = torch.from_numpy(world.rotations[world.names.index(view.name)])
         torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+
+
+def test_every_path_to_a_scan_of_navvis_finds_its_points(world: World, tmp_path: Path) -> None:
+    write_navvis(world, tmp_path / "scan", 90)
+    pano = tmp_path / "scan" / "pano"
+    pano.mkdir(exist_ok=True)
+    for file in [*(tmp_path / "scan").glob("*.csv"), *(tmp_path / "scan").glob("*.png")]:
+        file.rename(pano / file.name)
+    (tmp_path / "scan" / "rest.e57").touch()
+    for path in (tmp_path / "scan", pano, pano / "pano-poses.csv"):
+        scene = load(path)
+        assert len(scene.points) == len(world.points), path
+        assert any("along y of their poses: colours agree by 0.9" in note for note in scene.notes), path
+        assert not any("not used: rest.e57" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize("black", [False, True])
+def test_scans_without_colours_do_not_hide_those_of_others(black: bool) -> None:
+    points = torch.arange(12, dtype=torch.float64).reshape(4, 3)
+    plain = Cloud(points[3:], torch.zeros(1, 3, dtype=torch.uint8) if black else None)
+    coloured = Cloud(points[:3], torch.full((3, 3), 9, dtype=torch.uint8))
+    for clouds in ([coloured, plain], [plain, coloured]):
+        cloud, (note,) = joined(clouds)
+        assert torch.equal(cloud.points, points[:3]) and torch.equal(cloud.colors, coloured.colors)
+        assert note == "points: 1 of scans without colours are left out, as others have colours"
+    cloud, notes = joined([plain, plain])
+    assert len(cloud.points) == 2 and cloud.colors is None and not notes
 
 
 @pytest.mark.parametrize("points", ["random", "grey.ply"])
