@@ -94,15 +94,19 @@ def refuse_several_pictures(image: Image.Image, path: object) -> None:
         raise DataError(f"{path} says that it is stereo ({mode}): {_STEREO}, or {_REMOVE}")
 
 
-def crop_of(image: Image.Image, path: object) -> Crop | None:
-    """Return where the picture lies in its panorama (GPano); None if it is all; a DataError if numbers disagree."""
+def crop_of(image: Image.Image, path: object, within: Crop | None = None) -> Crop | None:
+    """Return where the picture lies in its panorama (GPano); None if it is all; a DataError if numbers disagree.
+
+    A mask that states nothing has the place of its image, `within`, if it has the size of the image's file.
+    """
     xmp = _xmp(image)
     if (projection := stated(xmp, "ProjectionType") or "equirectangular").casefold() != "equirectangular":
         remedy = f"convert it with the program that made it, or {_REMOVE}"
         raise DataError(f"{path} says that its projection is {projection!r}, not equirectangular; {remedy}")
     texts = {name: stated(xmp, name) for name in _CROP_PROPERTIES}
     if all(text is None for text in texts.values()):
-        return None
+        is_same = within and max(abs(image.width - within.width), abs(image.height - within.height)) <= 1
+        return within if is_same else None
     said = ", ".join(f"{name} {text}" for name, text in texts.items() if text is not None)
     contradiction = f"{path} contradicts itself: it is {image.width}x{image.height} and says {said}; {_REMOVE}"
     usual = (image.width, image.height, image.width, image.height, 0, 0)
@@ -118,12 +122,13 @@ def crop_of(image: Image.Image, path: object) -> Crop | None:
         raise DataError(contradiction)
     if (width, height) == (full_width, full_height):
         return None
+    if full_width != 2 * full_height:
+        rule = "which is not 2:1; correct FullPanoWidthPixels and FullPanoHeightPixels with exiftool"
+        raise DataError(f"{path} says that it is a part of a panorama of {full_width}x{full_height}, {rule}")
     # The panorama of a resized picture is 2:1 too; to fit in whole pixels, the picture is stretched by one at most.
     rows = round(full_height * (image.width + image.height) / (width + height))
-    columns = 2 * rows if full_width == 2 * full_height else round(full_width * rows / full_height)
-    left, right = (round(edge * columns / full_width) for edge in (left, left + width))
-    top, bottom = (round(edge * rows / full_height) for edge in (top, top + height))
-    return Crop(left, top, right - left, bottom - top, columns, rows)
+    left, top, right, bottom = (round(of * rows / full_height) for of in (left, top, left + width, top + height))
+    return Crop(left, top, right - left, bottom - top, 2 * rows, rows)
 
 
 def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[Image.Image], Image.Image] | None:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from padgs.data import image_metadata
 from padgs.data.capture import DataError, listed, refuse_special
-from padgs.data.image_metadata import Crop
+from padgs.data.image_metadata import Crop, crop_of
 from padgs.files import DAMAGE, ImageError, open_image
 
 EXTENSIONS = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp")
@@ -64,13 +64,10 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True, within: Cr
         image_metadata.refuse_several_pictures(image, path)
         mode = image.mode
         _refuse_other_modes(image, data, path, mask)
-        crop = _crop(image, path, within) if panorama else None
+        crop = crop_of(image, path, within) if panorama else None
         conversion = None if mask else image_metadata.srgb_conversion(image, data, path)
         size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
         may_be_transparent = mode in _ALPHA or "transparency" in image.info
-    if crop is not None and crop.full_width != 2 * crop.full_height:
-        what = f"{path} says that it is a part of a panorama which is not 2:1 ({crop.full_width}x{crop.full_height})"
-        raise DataError(f"{what}; correct FullPanoWidthPixels and FullPanoHeightPixels with exiftool")
     if panorama:
         refuse_other_shapes(*size, path)
     is_cut = _looks_cut(data)
@@ -147,21 +144,12 @@ def save_png(pixels: Tensor, path: Path) -> None:
     Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
 
 
-def _crop(image: Image.Image, path: Path, of_image: Crop | None) -> Crop | None:
-    """Return the crop that a file states, else that of the image whose mask it is if they have one size."""
-    crop = image_metadata.crop_of(image, path)
-    if crop is None and of_image is not None:
-        is_same = max(abs(image.width - of_image.width), abs(image.height - of_image.height)) <= 1
-        return of_image if is_same else None
-    return crop
-
-
 def _decode(data: bytes, path: Path, mode: str, within: Crop | None = None) -> NDArray[np.uint8]:
     with refused_if_damaged(path), open_image(BytesIO(data), path) as image:
         image.load()
         transparent = _is_transparent(image)
         convert = image_metadata.srgb_conversion(image, data, path) if mode == "RGB" else None
-        crop, stored = _crop(image, path, within), _eight_bit(image).convert(mode)
+        crop, stored = crop_of(image, path, within), _eight_bit(image).convert(mode)
         spread = np.ptp(np.asarray(image.convert("RGB")), axis=-1) if mode == "L" and image.mode in _COLOUR else 0
         is_coloured = np.mean(spread > COLOURED) > 1e-3  # whose brightness means nothing; JPEG leaves a few faint ones
         cut = _misses_pixels(image, data, np.asarray(stored))

@@ -12,17 +12,9 @@ from torch import Tensor
 
 from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
+from padgs.render import projection
 from padgs.render.contract import ALPHA_MIN, Request
-from padgs.render.projection import (
-    Footprints,
-    camera_frame,
-    is_on_image,
-    is_sound,
-    low_pass_filtered,
-    low_pass_of,
-    plane_covariance,
-    square_boxes,
-)
+from padgs.render.projection import Footprints
 
 PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, for every image size
 LEAST_COS_LATITUDE, LEAST_DIVISOR = 1e-4, 1e-20  # keep the directions of the poles finite
@@ -87,27 +79,27 @@ class RayFootprints(Footprints):
 def project_tangent(request: Request) -> TangentFootprints:
     """Project to the tangent plane spanned by E: S = E Sigma E^T / r^2 (+ the angular low-pass)."""
     camera, options = request.camera, request.options
-    means, orientations = camera_frame(request)
+    means, orientations = projection.camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
     if request.mean_offsets is not None:
         means = means + mean_shift(means, request.mean_offsets)
-    low_pass = low_pass_of(options, camera)
-    gaussians, low_pass = low_pass_filtered(request.gaussians, means, low_pass), low_pass.in_plane
+    low_pass = projection.low_pass_of(options, camera)
+    gaussians, low_pass = projection.low_pass_filtered(request.gaussians, means, low_pass), low_pass.in_plane
     radius = means.norm(dim=-1)
     normal = means / radius[:, None]
     tangent = _tangent_basis(normal)  # [N, 2, 3]
     spread = orientations * gaussians.scales[:, None, :]
     half = tangent @ spread / radius[:, None, None]  # [N, 2, 3]
-    var_0, covariance, _, determinant = plane_covariance(half, low_pass)
+    var_0, covariance, _, determinant = projection.plane_covariance(half, low_pass)
     # L = C^-1 E with the Cholesky factor C of S: its first row is E_0 / c, its second orthogonal to it under S.
     first = tangent[:, 0] / torch.sqrt(var_0)[:, None]
     second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) / torch.sqrt(determinant / var_0)[:, None]
     whitening = torch.stack((first, second), dim=-2)
-    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & is_sound(determinant)
+    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & projection.is_sound(determinant)
     boxes, rays = None, camera.rays(dtype=means.dtype, device=means.device)
     if options.bounds == "square" and isinstance(camera, Panorama):
         boxes = tangent_boxes(means.detach(), spread.detach(), determinant.detach(), low_pass, camera)
-        visible &= is_on_image(boxes, camera.width, camera.height)
+        visible &= projection.is_on_image(boxes, camera.width, camera.height)
     return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, rays)
 
 
@@ -118,11 +110,11 @@ def project_ray(request: Request) -> RayFootprints:
     the plane n.x = near, n the direction of the mean: r - sqrt(k n^T Sigma n) <= near (SPaGS).
     """
     camera, options = request.camera, request.options
-    means, orientations = camera_frame(request)
+    means, orientations = projection.camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
     if request.mean_offsets is not None:
         means = means + mean_shift(means, request.mean_offsets)
-    gaussians = low_pass_filtered(request.gaussians, means, low_pass_of(options, camera))
+    gaussians = projection.low_pass_filtered(request.gaussians, means, projection.low_pass_of(options, camera))
     radius, opacities = means.norm(dim=-1), gaussians.opacities
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
@@ -168,4 +160,4 @@ def tangent_boxes(means: Tensor, spread: Tensor, determinant: Tensor, low_pass: 
     var_u, var_v = ((jacobian @ spread) ** 2).sum(-1).unbind(-1)
     trace = var_u + (right / written) ** 2 * var_v + 2 * low_pass * PUBLISHED_FOCAL**2
     centers = pixel_from_angles(*longitude_latitude(means), camera.width, camera.height)
-    return square_boxes(centers, 0.5 * trace, determinant * PUBLISHED_FOCAL**4)
+    return projection.square_boxes(centers, 0.5 * trace, determinant * PUBLISHED_FOCAL**4)

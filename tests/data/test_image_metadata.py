@@ -99,7 +99,7 @@ def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_
         ({"FullPanoWidthPixels": "wide"}, "contradicts itself"),
         ({"CroppedAreaImageWidthPixels": 0}, "contradicts itself"),
         ({"CroppedAreaImageHeightPixels": 20}, "contradicts itself"),
-        ({"FullPanoHeightPixels": 79}, r"says that it is a part of a panorama which is not 2:1 \(160x79\); correct"),
+        ({"FullPanoHeightPixels": 79}, "says that it is a part of a panorama of 160x79, which is not 2:1; correct"),
         ({"StereoMode": "top-bottom"}, r"says that it is stereo \(top-bottom\)"),
         ({"Orientation": 6}, "carries XMP orientation 6"),
     ],

@@ -12,23 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from padgs.checks import check, check_known
-from padgs.methods.egonerf.grids import (
-    CHARTS,
-    MODES,
-    YANG,
-    YIN,
-    Factors,
-    GridPosition,
-    PlaneLines,
-    density_feature,
-    exponential_nodes,
-    grid_position,
-    interval_lengths,
-    jittered,
-    products,
-    refined,
-    visible_shares,
-)
+from padgs.methods.egonerf import grids
+from padgs.methods.egonerf.grids import Factors, GridPosition, PlaneLines
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 
@@ -160,8 +145,9 @@ class EgoNeRF(nn.Module):
         # Half the diagonal of a cube around the reach of all rays, as published.
         reach = math.sqrt(3) * (travel + constants.far)
         first, samples = constants.first_radius, options.coarse_samples
-        self.register_buffer("nodes", exponential_nodes(first, reach, options.radial_nodes).float(), persistent=False)
-        distances = constants.near + exponential_nodes(first, constants.far - constants.near, samples)
+        nodes = grids.exponential_nodes(first, reach, options.radial_nodes)
+        self.register_buffer("nodes", nodes.float(), persistent=False)
+        distances = constants.near + grids.exponential_nodes(first, constants.far - constants.near, samples)
         self.register_buffer("distances", distances.float(), persistent=False)
 
     @classmethod
@@ -182,7 +168,7 @@ class EgoNeRF(nn.Module):
         distances = self._sample(origins, directions, generator)
         at = self._at(origins, directions, distances)
         depths = self._optical_depths(self.density.factors(), at, distances)
-        weights, residual = visible_shares(depths)
+        weights, residual = grids.visible_shares(depths)
         color = self._shade(at, directions, weights)
         if self.environment is not None:
             color = color + residual[:, None] * self.environment(directions)
@@ -219,21 +205,21 @@ class EgoNeRF(nn.Module):
         first = coarse.expand(len(origins), -1)
         within = coarse.new_full((len(origins), count), 0.5)  # position in each quantile
         if generator is not None:
-            first = jittered(first, torch.rand(first.shape, generator=generator).to(coarse))
+            first = grids.jittered(first, torch.rand(first.shape, generator=generator).to(coarse))
             within = torch.rand(within.shape, generator=generator).to(coarse)
         at = self._at(origins, directions, first)
-        weights, _ = visible_shares(self._optical_depths(self.density.coarse(), at, first))
-        second = refined(first, weights, (torch.arange(count, device=coarse.device).to(coarse) + within) / count)
+        weights, _ = grids.visible_shares(self._optical_depths(self.density.coarse(), at, first))
+        second = grids.refined(first, weights, (torch.arange(count, device=coarse.device).to(coarse) + within) / count)
         return torch.cat((first, second), dim=-1).sort(dim=-1).values
 
     def _at(self, origins: Tensor, directions: Tensor, distances: Tensor) -> GridPosition:
         points = origins[:, None] + distances[..., None] * directions[:, None]
-        return grid_position(points.reshape(-1, 3), self.get_buffer("nodes"))
+        return grids.grid_position(points.reshape(-1, 3), self.get_buffer("nodes"))
 
     def _optical_depths(self, factors: Factors, at: GridPosition, distances: Tensor) -> Tensor:
-        feature = density_feature(factors, at).view(distances.shape)
+        feature = grids.density_feature(factors, at).view(distances.shape)
         density = functional.softplus(feature + self.constants.density_shift)
-        return density * interval_lengths(distances) * self.constants.distance_scale
+        return density * grids.interval_lengths(distances) * self.constants.distance_scale
 
     def _shade(self, at: GridPosition, directions: Tensor, weights: Tensor) -> Tensor:
         """Return colours [B, 3], summed over samples."""
@@ -241,7 +227,7 @@ class EgoNeRF(nn.Module):
         counts = (weights.detach().reshape(-1) >= self.options.min_weight).nonzero().squeeze(-1)
         ray = counts // samples
         at = GridPosition(*(values[counts] for values in at))
-        color = self.shader(products(self.appearance.factors(), at), at.chart, directions[ray])
+        color = self.shader(grids.products(self.appearance.factors(), at), at.chart, directions[ray])
         return color.new_zeros(rays, 3).index_add(0, ray, color * weights.reshape(-1)[counts, None])
 
 
@@ -251,9 +237,9 @@ class Shader(nn.Module):
     def __init__(self, options: EgoNeRFOptions) -> None:
         super().__init__()
         features, hidden = options.features, options.hidden
-        inputs = len(MODES) * options.appearance_components
+        inputs = len(grids.MODES) * options.appearance_components
         bound = 1 / math.sqrt(inputs)
-        self.basis = nn.Parameter(torch.empty(CHARTS, features, inputs).uniform_(-bound, bound))
+        self.basis = nn.Parameter(torch.empty(grids.CHARTS, features, inputs).uniform_(-bound, bound))
         width = (features + 3) * (1 + 2 * FREQUENCIES)
         last = nn.Linear(hidden, 3)
         nn.init.zeros_(last.bias)
@@ -261,9 +247,9 @@ class Shader(nn.Module):
         self.network = nn.Sequential(*layers, last, nn.Sigmoid())
 
     def forward(self, products: Sequence[Tensor], chart: Tensor, directions: Tensor) -> Tensor:
-        """Return colours [N, 3] from `grids.products`, charts [N] of the positions, and unit directions [N, 3]."""
+        """Return colours [N, 3] from `products`, charts [N] of the positions, and unit directions [N, 3]."""
         stacked = torch.cat(list(products))
-        features = torch.where(chart == YANG, self.basis[YANG] @ stacked, self.basis[YIN] @ stacked).T
+        features = torch.where(chart == grids.YANG, self.basis[grids.YANG] @ stacked, self.basis[grids.YIN] @ stacked).T
         encoded = encoding(features, FREQUENCIES), encoding(directions, FREQUENCIES)
         return self.network(torch.cat(encoded, dim=-1))
 

@@ -12,15 +12,8 @@ from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
 from padgs.geometry.camera import Camera
-from padgs.render.contract import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    CORE_ALPHA_MIN,
-    TRANSMITTANCE_MIN,
-    Rendering,
-    RenderOptions,
-    Request,
-)
+from padgs.render import contract
+from padgs.render.contract import Rendering, RenderOptions, Request
 from padgs.render.projection import Footprints, project
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
@@ -94,13 +87,13 @@ def fragments(
     q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
     if absgrad is not None:
         q = WithAbsgrad.apply(q, footprints.slope(order, rows, columns), absgrad[order])
-    alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
-    return torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
+    alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=contract.ALPHA_MAX)
+    return torch.where(inside & (alpha.detach() >= contract.ALPHA_MIN), alpha, torch.zeros_like(alpha))
 
 
 def sorted_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Return the weights [P, K] of fragments sorted front to back, and the transmittance [P]."""
-    running = torch.cumprod(1 - alpha.detach(), dim=-1) >= TRANSMITTANCE_MIN
+    running = torch.cumprod(1 - alpha.detach(), dim=-1) >= contract.TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     after = torch.cumprod(1 - alpha, dim=-1)
     after = torch.cat((alpha.new_ones(len(alpha), 1), after), dim=-1)  # transmittance before each and behind the last
@@ -119,7 +112,7 @@ def hybrid_weights(alpha: Tensor, distance: Tensor, core_size: int) -> tuple[Ten
     is a constant to autograd. Fragments are sorted along the ray of the pixel, so that nothing pops when the order of
     the means changes; the price is a tail without order.
     """
-    solid = alpha.detach() >= CORE_ALPHA_MIN
+    solid = alpha.detach() >= contract.CORE_ALPHA_MIN
     key = torch.where(solid, distance, torch.full_like(distance, torch.inf))
     nearest = torch.argsort(key, dim=-1, stable=True)[:, :core_size]
     in_core = torch.zeros_like(solid).scatter(1, nearest, solid.gather(1, nearest))
@@ -127,7 +120,7 @@ def hybrid_weights(alpha: Tensor, distance: Tensor, core_size: int) -> tuple[Ten
 
     core = torch.where(in_core, alpha, none).gather(1, nearest)  # front to back
     after = torch.cumprod(1 - core, dim=-1)
-    after = torch.where(after.detach() >= TRANSMITTANCE_MIN, after, torch.zeros_like(after))
+    after = torch.where(after.detach() >= contract.TRANSMITTANCE_MIN, after, torch.zeros_like(after))
     after = torch.cat((alpha.new_ones(len(alpha), 1), after), dim=-1)  # before each and behind the last
     core_weights = none.scatter(1, nearest, core * after[:, :-1])
     through = after[:, -1]
