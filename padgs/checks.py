@@ -154,6 +154,7 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         return None
     if kind is bool and isinstance(value, bool):
         return value
+    value = str(value).lower() if kind is str and isinstance(value, bool) else value  # a word that YAML reads as a bool
     if kind is str and isinstance(value, str):
         if any(0xD800 <= ord(character) < 0xE000 for character in value):
             raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename the file or value")

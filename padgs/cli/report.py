@@ -74,7 +74,8 @@ def report(
             write_files(texts, target)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
-    show(f"{len(found)} results, {len(broken)} left out; see {target}", sys.stderr)
+    without = f", and {refused} reports without a table" if refused else ""
+    show(f"{len(found)} results, {len(broken)} left out{without}; see {target}", sys.stderr)
     command = shlex.join(["padgs", "report", "html", runs, *(["--out", out] if out else [])])
     opened = f"open {target / 'report.html'} in a browser"
     show(f"next: {opened if what in ('html', ALL) else command}", sys.stderr)

@@ -53,6 +53,7 @@ TOO_LATE = {
     "data.dataset=x": "unknown dataset 'x'; known: roam360",
     "data.path=": "path is ; it must be null, or not empty",
     "run.folder=": "folder is ; it must be not empty",
+    "smallest=true": "unknown smallest 'true'; known: off, on",
 }
 OF_ANOTHER_TYPE = {
     "protocol.paper=null": "protocol.paper is None; it must be a group of keys",
