@@ -175,7 +175,8 @@ def without_data(runs: DataFrame) -> DataFrame:
 
 def _hardware(result: Result) -> str:
     known = result.machine
-    where = known.get("gpu") or f"{known.get('cores')} cores of {known.get('cpu')}"
+    count = known.get("cores")
+    where = known.get("gpu") or f"{count} core{'s' * (count != 1)} of {known.get('cpu')}"
     return f"{where}, torch {known.get('torch')}"
 
 

@@ -133,10 +133,8 @@ def write_ply(path: Path, cloud: Cloud) -> None:
 
 
 def joined(clouds: Sequence[Cloud]) -> tuple[Cloud, tuple[str, ...]]:
-    """Return the points of several clouds as one, and notes; if some clouds have colours, without those of the others.
-
-    Orientations are recognised by colours, which black ones of scanners without a camera, or grey, would hide.
-    """
+    """Return the points of several clouds as one, and notes; without those that lack colours if others have them."""
+    # Orientations are recognised by colours, which black ones of scanners without a camera, or grey, would hide.
     coloured = [cloud for cloud in clouds if cloud.colors is not None and cloud.colors.any()]
     used = coloured or clouds
     points = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(cloud.points for cloud in used)])

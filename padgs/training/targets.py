@@ -15,14 +15,7 @@ from torch.nn.functional import interpolate
 from padgs.geometry.camera import Panorama, pixel_solid_angles
 from padgs.geometry.panorama import Device
 from padgs.scene import Scene, View
-from padgs.training.loss import (
-    MEASURED,
-    SQUARES_SHARE,
-    inverse_range_loss,
-    photometric_loss,
-    pixel_weight,
-    squared_error,
-)
+from padgs.training import loss as losses
 from padgs.training.model import State
 
 if TYPE_CHECKING:
@@ -44,10 +37,12 @@ class Target:
 
     def loss(self, image: Tensor, depth: Tensor, options: TrainOptions, unit: float) -> Tensor:
         """Return the loss of an image [H, W, 3] and its depth [H, W], a scalar; `unit` is the scene scale."""
-        loss = photometric_loss(image, self.image, self.weight, options.lambda_l1, normalisation=options.normalisation)
+        loss = losses.photometric_loss(
+            image, self.image, self.weight, options.lambda_l1, normalisation=options.normalisation
+        )
         if self.depth is None:
             return loss
-        more = inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
+        more = losses.inverse_range_loss(depth, self.depth, self.weight, unit, options.depth_kind)
         return loss + options.depth_weight * more
 
     def with_background(self, image: Tensor, transmittance: Tensor, color: Sequence[float]) -> Tensor:
@@ -61,9 +56,9 @@ class Target:
 
     def squares(self, image: Tensor, options: TrainOptions, progress: float) -> Tensor | float:
         """Return what squared errors of an image [H, W, 3] add to the loss at a share of the run."""
-        if options.square_weight == 0 or progress <= 1 - SQUARES_SHARE:
+        if options.square_weight == 0 or progress <= 1 - losses.SQUARES_SHARE:
             return 0.0
-        return options.square_weight * squared_error(image, self.image, self.weight)
+        return options.square_weight * losses.squared_error(image, self.image, self.weight)
 
 
 class Targets:
@@ -85,7 +80,7 @@ class Targets:
         """Load nothing yet; `weight` is a name of ROW_WEIGHTS, `depth` one of DEPTH_KINDS if depth maps are used."""
         if depth and not any(view.load_depth for view in views):
             raise ValueError("train.depth_weight is not 0, but no training view has a depth map; put them into depths/")
-        if depth == MEASURED and any(view.depth_is_relative for view in views):
+        if depth == losses.MEASURED and any(view.depth_is_relative for view in views):
             raise ValueError("train.depth_kind=measured, but depth maps are relative; set train.depth_kind=monocular")
         self._weight, self._device, self._coarse_share, self._depth = weight, device, coarse_share, depth
         self._weights: dict[tuple[int, int], Tensor] = {}  # by the number of halvings and the index of the view
@@ -132,7 +127,7 @@ def weight_of(view: View, weight: str, device: Device = "cpu") -> Tensor:
     mask, is_panorama = view.mask(device=device), isinstance(view.camera, Panorama)
     mask = None if mask is None else _checked_size(view, "mask", mask)
     try:
-        rows = pixel_weight(weight if is_panorama else "uniform", view.height, mask, device=device)
+        rows = losses.pixel_weight(weight if is_panorama else "uniform", view.height, mask, device=device)
     except ValueError as error:
         raise ValueError(f"view {view.name!r}: {error}") from error
     if is_panorama or weight != "solid_angle":
