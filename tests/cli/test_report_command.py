@@ -82,6 +82,13 @@ def test_control_characters_in_names_are_escaped(tmp_path):
     assert done.exit_code == 0 and "\x1b" not in done.output and "<b>" not in done.output
 
 
+def test_parts_of_a_report_that_cannot_be_made_are_counted(runs):
+    assert "reports without a table" not in report("all", runs).output
+    done = report("all", runs, "--metric", "bogus")
+    count = done.output.count("unknown metric 'bogus'")
+    assert count > 1 and f"0 left out, and {count} reports without a table; see " in done.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -6,7 +6,7 @@ import os
 import struct
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from padgs.data import DataError, load, read
 from padgs.data import scans as scans_module
 from padgs.data.capture import Cloud
 from padgs.data.cloud import joined, read_cloud, write_ply
+from padgs.data.formats.scanners import _named_images
 
 
 @pytest.mark.parametrize(("turn", "along"), [(0, "x"), (90, "y"), (180, "-x"), (-90, "-y")])
@@ -42,6 +43,20 @@ def test_every_path_to_a_scan_of_navvis_finds_its_points(world: World, tmp_path:
         assert len(scene.points) == len(world.points), path
         assert any("along y of their poses: colours agree by 0.9" in note for note in scene.notes), path
         assert not any("not used: rest.e57" in note for note in scene.notes)
+
+
+def test_images_of_e57_files_that_would_share_a_name_are_numbered() -> None:
+    class Node(dict):
+        isDefined = dict.__contains__
+        childCount = dict.__len__
+
+        def value(self) -> str:
+            return self["value"]
+
+    stated = ["a", "a.jpg", "A.PNG", "a.1", "a.2"]
+    images = Node(enumerate(Node(name=Node(value=name)) for name in stated))
+    names = [name for name, _ in _named_images(SimpleNamespace(root=Node(images2D=images)))]
+    assert names == ["a", "a.jpg_00001", "A.PNG_00002", "a.1", "a.2"]
 
 
 @pytest.mark.parametrize("black", [False, True])

@@ -87,6 +87,15 @@ def test_masks_that_belong_to_no_panorama_are_noted(tmp_path):
     assert source.notes[-1].startswith("not used: hall/Sky Masks/1.png, hall/masks/c.png; a mask of all panoramas must")
 
 
+def test_a_video_with_one_frame_is_refused_by_its_name(tmp_path, monkeypatch):
+    frames = iter([np.zeros((16, 32, 3), np.uint8)])
+    monkeypatch.setattr("padgs.data.prepare.sources._sharpest", lambda *_: frames)
+    with pytest.raises(
+        DataError, match=r"tour.mp4 gives 1 frames at 2 a second; .*: take more a second \(`--per-second`"
+    ):
+        extract_frames(tmp_path / "tour.mp4", tmp_path, 2.0)
+
+
 def test_the_named_folder_is_taken_if_it_holds_panoramas_itself(tmp_path):
     for name in ("a.png", "b.png", "rgb/c.png", "images/d.png"):
         save(tmp_path / name)
