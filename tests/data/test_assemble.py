@@ -15,6 +15,8 @@ from support.fixtures import World, write_colmap_text, write_transforms
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
 from padgs.data.assemble import disk_cache
+from padgs.data.capture import Cloud
+from padgs.data.cloud import write_ply
 
 
 @pytest.fixture
@@ -60,6 +62,13 @@ def test_georeferenced_captures_are_recentered(world: World, folder: Path, tmp_p
     torch.testing.assert_close(far.points + shift, near.points, atol=1e-5, rtol=0)
     for one, other in zip(near.train, far.train, strict=True):
         torch.testing.assert_close(other.center + shift, one.center, atol=1e-6, rtol=0)
+
+
+def test_points_of_another_world_than_the_cameras_are_refused(world: World, folder: Path) -> None:
+    cloud = Cloud(torch.from_numpy(world.points) + torch.tensor([5e5, 5.4e6, 0.0]), None)
+    write_ply(folder / "map.ply", cloud)
+    with pytest.raises(DataError, match=r"so not in one world; export both .*Metashape: points in local coordinates"):
+        load(folder, points="map.ply")
 
 
 def test_images_and_cameras_of_different_size(folder: Path) -> None:
