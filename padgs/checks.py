@@ -75,6 +75,7 @@ LIMITS: dict[object, tuple[int, int]] = {
     **dict.fromkeys(("features", "hidden", "offsets", "components", "levels", "frequencies"), (0, 1024)),
     **dict.fromkeys(("bytes", "cap", "instances"), (0, 10**15)),
     "points": (0, 10**8),
+    "gaussians": (1, 10**9),
     "seed": (0, 2**63 - 1),
     int: (0, 10**9),
     float: (-(10**6), 10**6),

@@ -34,6 +34,7 @@ from padgs.geometry.distortion import solid_angle_weight
 from padgs.methods.splats.depth_initialization import visible_points
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of
+from padgs.results import flat
 from padgs.runs.console import say, show_result
 from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import build_method, initial_result, load_scene, scored, start
@@ -186,6 +187,9 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
     frames = {view_name(frame.name): frame for frame in capture.frames}
     masks = {view.name: view.load_mask for view in (*scene.train, *scene.test)}
     given = {key: value for key, value in asdict(options).items() if key in ("images", "mask", "split", "dataset")}
+    for key in ("images", "mask"):  # `padgs merge` may run elsewhere
+        if given[key] and os.path.exists(given[key]) and not (source / given[key]).exists():
+            given[key] = os.path.abspath(given[key])
     lines = []
     destination.parent.mkdir(parents=True, exist_ok=True)
     with draft_of(destination) as partial:
@@ -220,7 +224,7 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
                 described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))
                 file.write_text(json.dumps(described | {"mask": "masks"}, ensure_ascii=False), encoding="utf-8")
             block = {"number": number, "count": count, "format": format, "options": given, "regions": digest}
-            block["source"] = os.path.relpath(source.absolute(), final.absolute())
+            block["source"] = os.path.relpath(source.resolve(), final.resolve())
             (folder / BLOCK).write_text(json.dumps(block, indent=1))
             parts = f"{len(core)} training views, {len(margin)} in the margin, {len(blocks.test[number])} test views"
             lines.append(f"{final}: {parts}, {int(kept.sum())} points")
@@ -243,9 +247,16 @@ def partial_mask(view: View, held: np.ndarray) -> Callable[[], Tensor]:
     return load
 
 
-def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> Path:
-    """Join the runs of all blocks into a run on the whole data set, and score that on all test views."""
+def merge(folders: Sequence[str], console: Console, *, data: str = "", device: str = "auto") -> Path:
+    """Join the runs of all blocks into a run on the whole data set, and score that on all test views.
+
+    `data` is the folder of the blocks, if it has moved since `split`. Runs of one method with other settings are joined
+    with a note; the result has those of the first block.
+    """
     loaded = [load_run(folder, device=device) for folder in folders]
+    if data:
+        paths = [Path(data) / _folder_of(run).name for run in loaded]
+        loaded = [load_run(run.folder, data_path=path, device=device) for run, path in zip(loaded, paths, strict=True)]
     pairs = sorted(((_block_of(run), run) for run in loaded), key=lambda pair: pair[0]["number"])
     (block, first), runs, numbers = pairs[0], [run for _, run in pairs], [other["number"] for other, _ in pairs]
     for other, run in pairs:
@@ -256,17 +267,23 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
         if numbers.count(number) != 1:
             trouble = "no run" if number not in numbers else "several runs"
             raise ValueError(f"block {number + 1} of {block['count']} has {trouble}; give one run of each block")
-    folder = Path(str(first.config.data.path))
+    differing = sorted({key for run in runs for key in _differing(run, first)})
+    if differing:
+        say(console, f"trained differently: {', '.join(differing)}; the merged run states those of {first.folder}")
+    folder = _folder_of(first).resolve()
     whole = {"path": os.path.normpath(folder / block["source"]), "format": block["format"], **block["options"]}
     together = hashlib.sha256("".join(run.digest for run in runs).encode()).hexdigest()
     config = replace(
         first.config,
         data=replace(first.config.data, **whole),
-        variant=", ".join(filter(None, (first.config.variant, f"{block['count']} blocks"))),
+        variant=", ".join(filter(None, (first.config.variant, f"{block['count']} blocks" + " mixed" * bool(differing)))),
         init=WarmStart(" ".join(str(run.folder) for run in runs), together),
     )
     scene = load_scene(config, start(config))
     store = RunStore.of(config, scene)
+    if (before := store.result()) is not None and before.ok:
+        show_result(before, store.path, console)
+        return store.path
     with np.load(folder.parent / REGIONS, allow_pickle=False) as regions:
         state = _joined(runs, numbers, regions, scene)
     with store:
@@ -294,11 +311,27 @@ def merge(folders: Sequence[str], console: Console, *, device: str = "auto") -> 
     return store.path
 
 
+def _folder_of(run: LoadedRun) -> Path:
+    """Return the folder of the data set of a run, which may be given as a file in it."""
+    path = Path(run.config.data.path or "")
+    return path.parent if path.suffix == ".json" else path
+
+
+def _differing(run: LoadedRun, first: LoadedRun) -> set[str]:
+    """Return the keys of settings of data, training and scores that differ between two runs."""
+    ours, others = (dict(flat(other.config.values())) for other in (run, first))
+    keys = {key for key in ours.keys() | others.keys() if ours.get(key) != others.get(key)}
+    return {key for key in keys if key != "data.path" and not key.startswith("run.")}
+
+
 def _block_of(run: LoadedRun) -> dict[str, Any]:
     """Return the description of the block of a run, which must be what the run was trained on."""
-    folder = Path(run.config.data.path or "")
+    folder = _folder_of(run)
     if run.config.data.path is None or not (folder / BLOCK).is_file():
-        raise ValueError(f"{run.folder} is of no block: {folder / BLOCK} is missing; train what padgs split wrote")
+        raise ValueError(
+            f"{run.folder} is of no block: {folder / BLOCK} is missing; train what padgs split wrote, or if it has moved, "
+            "name the folder of the blocks with --data"
+        )
     block = json.loads((folder / BLOCK).read_text())
     if hashlib.sha256((folder.parent / REGIONS).read_bytes()).hexdigest() != block.get("regions"):
         raise ValueError(f"{folder.parent / REGIONS} is not that of {folder}; split the data set again")

@@ -103,9 +103,11 @@ def write_video(
     is_mp4 = to.suffix.lower() == ".mp4"
     if to.suffix and not is_mp4 and not to.is_dir():
         raise ValueError(f"{to} is not an .mp4, the only video format; a folder for PNGs must have no suffix")
+    if to.name.lower() == ".mp4":
+        raise ValueError(f"{to} has no name before its suffix; name the video, such as {to.with_name('film.mp4')}")
     if npy and (is_mp4 or not depth):
         raise ValueError("--npy is about depth in numbers: add --depth and --to FOLDER")
-    outputs = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
+    outputs = [to, to.with_name(f"{to.stem}-depth{to.suffix}" if is_mp4 else f"{to.name}-depth")] if depth else [to]
     unit = 1.0 if npy else scene_scale / DEPTH_STEPS
     with ExitStack() as stack:
         if is_mp4:

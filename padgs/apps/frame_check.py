@@ -2,10 +2,11 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from padgs.geometry.similarity import Similarity
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 
+Draw = Callable[[Similarity, View], Rendering]  # a view, with the Gaussians moved
 IDENTITY = "identity"
 WIDTH, VIEWS, SEARCHED = 128, 4, 2  # of the low-resolution renders; views of the search for another world
 MARGIN, LEAST = 3.0, 1.0  # dB above one colour per view: in the right world for sure; if no other world is better
@@ -91,23 +93,26 @@ def as_numbers(similarity: Similarity) -> str:
 
 @dataclass(frozen=True)
 class FrameCheck:
-    """PSNR of low-resolution renders of training views, and a better world if the file's is not the scene's."""
+    """PSNR of low-resolution renders of training views, and better rays, or a better world if the file's does not fit."""
 
     psnr: float
     one_color: float  # PSNR of the mean colour of each view
     suggestion: Similarity | None = None  # scene_from_file
+    rays: str = ""  # a name of `others` that shows the scene
     words: str = ""
     suggested_psnr: float = 0.0
 
     @property
     def fits(self) -> bool:
         """True if the renders show the scene."""
-        return self.psnr >= self.one_color + (MARGIN if self.suggestion else LEAST)
+        return self.psnr >= self.one_color + (MARGIN if self.suggestion or self.rays else LEAST)
 
     def __str__(self) -> str:
         text = f"training views at {WIDTH} pixels: {self.psnr:.1f} dB; one colour each: {self.one_color:.1f} dB"
         if self.fits:
             return f"{text}; the file is in the world of the scene"
+        if self.rays:
+            return f"{text}; {self.suggested_psnr:.1f} dB with --rays {self.rays}, as it was trained: add that"
         text += "; the file is not in the world of the scene, or shows something else"
         if self.suggestion is None:
             return f"{text}. No change of axes, scale and place was found that fits"
@@ -115,11 +120,15 @@ class FrameCheck:
 
 
 def check_frame(
-    scene: Scene, render: Callable[[Similarity, View], Rendering], means: Tensor, nerfstudio: Similarity | None = None
+    scene: Scene,
+    render: Draw,
+    means: Tensor,
+    nerfstudio: Similarity | None = None,
+    others: Mapping[str, Draw] = MappingProxyType({}),
 ) -> FrameCheck:
-    """Render training views at a low resolution, and search for a better world if they do not fit.
+    """Render training views at a low resolution; if they do not fit, try `others`, and search for a better world.
 
-    `render` draws a view with the Gaussians under scene_from_file, `means` [N, 3] are the opaque ones in the file's
+    `render`, and `others` by the name of their rays, draw a view with the Gaussians under scene_from_file, `means` [N, 3] are the opaque ones in the file's
     world; `nerfstudio` is the scene_from_file of nerfstudio's `dataparser_transforms.json`, if there is one.
     """
     views = [view for view in scene.train if view.lens is None]
@@ -132,9 +141,9 @@ def check_frame(
         return FrameCheck(float("inf"), 0.0)
     truths, flat = [truths[index] for index in compared], mean(constants[index] for index in compared)
 
-    def quality(scene_from_file: Similarity, count: int = VIEWS) -> float:
+    def quality(scene_from_file: Similarity, count: int = VIEWS, draw: Draw = render) -> float:
         marks = [
-            ws_psnr(render(scene_from_file, view).image.clamp(0, 1).to(truth), truth, mask)
+            ws_psnr(draw(scene_from_file, view).image.clamp(0, 1).to(truth), truth, mask)
             for view, truth, mask in truths[:count]
         ]
         return torch.stack(marks).mean().item()
@@ -142,11 +151,14 @@ def check_frame(
     found = FrameCheck(quality(Similarity()), flat)
     if found.psnr >= flat + MARGIN or not len(means):
         return found
+    for rays, draw in others.items():
+        if (mark := quality(Similarity(), draw=draw)) > max(found.psnr, flat) + LEAST:
+            return FrameCheck(found.psnr, flat, rays=rays, suggested_psnr=mark)
     best = found
     for words, similarity in _worlds(scene, means, nerfstudio):
         mark = quality(similarity, SEARCHED)
         if mark > max(best.suggested_psnr, found.psnr + LEAST, flat + LEAST):
-            best = FrameCheck(found.psnr, flat, similarity, words, mark)
+            best = FrameCheck(found.psnr, flat, similarity, words=words, suggested_psnr=mark)
     return best
 
 

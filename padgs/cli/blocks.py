@@ -38,6 +38,7 @@ def split(
 
 def merge(
     runs: Annotated[list[str], typer.Argument(help="folders of the finished runs, one of each block")],
+    data: Annotated[str, typer.Option(help="folder of the blocks, if it has moved since padgs split")] = "",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
     """Join the runs of all blocks into one run on the whole data set, scored on all its test views."""
@@ -45,4 +46,4 @@ def merge(
 
     from padgs.apps.blocks import merge as join
 
-    join(runs, Console(highlight=False, soft_wrap=True), device=device)
+    join(runs, Console(highlight=False, soft_wrap=True), data=data, device=device)

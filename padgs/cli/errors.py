@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -47,6 +48,7 @@ def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
         warnings.formatwarning = lambda message, *_, **__: printable(f"warning: {message}\n")  # without a line of code
         try:
             with ending_by_signals():
+                _refuse_empty(command, options)
                 command(**options)
         except (typer.Exit, BrokenPipeError):  # typer ends in silence where the reader of the output has ended
             raise
@@ -55,6 +57,14 @@ def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from error
 
     return wrapped
+
+
+def _refuse_empty(command: Callable[..., None], options: dict[str, Any]) -> None:
+    """Raise a ValueError for an empty text where that is not the default of an option or argument."""
+    for name, parameter in signature(command).parameters.items():
+        value = options[name]
+        if value != parameter.default and (value == "" or isinstance(value, list) and "" in value):
+            raise ValueError(f"{name} is empty (is a variable of the shell unset?); give a value, or leave it out")
 
 
 def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) -> str:

@@ -58,8 +58,8 @@ def export(
         )
         status.update(Text(f"writing {printable(path.name)}"))
         with name_place(path):
-            write_splats(path, found.splats, found.notes, start=found.start)
-    show("\n".join(f"  {note}" for note in found.notes))
+            lost = write_splats(path, found.splats, found.notes, start=found.start)
+    show("\n".join(f"  {note}" for note in filter(None, (*found.notes, lost))))
     show(f"{path}: {len(found.splats)} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
 
 

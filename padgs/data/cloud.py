@@ -104,7 +104,7 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
         raise DataError(f"{path} has no element 'vertex'; it must be a point cloud") from error
     except (PlyParseError, OSError, ValueError, MemoryError, OverflowError, EOFError) as error:
         why = error or type(error).__name__
-        raise DataError(f"{path} is not a readable PLY file ({why}); export it again as PLY, LAS or E57") from error
+        raise DataError(f"{path} is not a readable PLY file ({why}); write or download it again") from error
     return vertex, {prop.name for prop in vertex.properties if not isinstance(prop, PlyListProperty)}
 
 

@@ -138,7 +138,8 @@ class Multirun:
             for index in lost:
                 is_refused = self._in_process or (error and self.states[index].status == Status.WAITING)  # none began
                 status = Status.REFUSED if is_refused else Status.KILLED
-                reason = f"a job ended without a status: {error or f'check the free space in {self.runs}'}"
+                ended = "no job began" if error and status == Status.REFUSED else "a job ended without a status"
+                reason = f"{ended}: {error or f'check the free space in {self.runs}'}"
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
 

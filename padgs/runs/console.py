@@ -170,7 +170,8 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
         say(console, note, "yellow")
     timing, peak, on_gpu = result.timing, result.peak_memory_bytes, result.peak_device_memory_bytes
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
-    costs.append(f"{result.model_bytes / 1e6:.1f} MB")
+    if result.model_bytes:
+        costs.append(f"{result.model_bytes / 1e6:.1f} MB")
     costs += [f"trained {duration(timing['train_seconds'])}"] if "train_seconds" in timing else []
     costs += [f"{timing['render_ms_median']:.1f} ms per frame"] if "render_ms_median" in timing else []
     costs += [f"peak memory {peak / 1e9:.2f} GB"] if peak else []  # not measured for models of other programs

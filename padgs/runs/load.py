@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -164,7 +165,7 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     try:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
         run = {"configuration": config_hash(values)}  # the data are not read
-        values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
+        values["data"]["path"] = _found(values["data"]["path"], store.path) if data_path is None else str(data_path)
         values["run"]["device"] = device
         if values["render"]["backend"] in missing_backends(device):
             values["render"]["backend"] = "auto"
@@ -182,6 +183,14 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         method.load_state(state)
         iteration = Progress(**state.values[PROGRESS]).iteration
     return LoadedRun(store.path, config, method, store.result(), iteration, digest)
+
+
+def _found(path: str | None, run: Path) -> str | None:
+    """Return a path of a run's data from here; if nothing is there, as seen from a folder above the run."""
+    if path is None or os.path.exists(path):
+        return path
+    above = (str(folder / path) for folder in run.absolute().parents)
+    return next(filter(os.path.exists, above), path)  # training began there
 
 
 def missing_backends(device: str) -> set[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -149,7 +150,41 @@ def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, cap
         assert kept[(x > 0.3) == side][x[(x > 0.3) == side].abs() > 0.3].float().mean() > 0.95
         count += int(kept.sum())
     assert count == len(means) == len(merged.method.model.groups()[0].row_rates())
+    before = (path / "result.json").stat().st_mtime_ns
     assert merge(runs[::-1], Console(quiet=True)) == path, "in any order"
+    assert (path / "result.json").stat().st_mtime_ns == before, "finished runs are kept"
+
+
+def test_blocks_that_were_trained_differently_are_joined_with_a_note(parts, runs, tmp_path, capsys):
+    """Also one that was trained by the file in it, and from another folder after both blocks have moved."""
+    other = trained(parts[1] / "transforms.json", tmp_path, "seed=3", "method.length_unit=nearest_camera")
+    path = merge([runs[0], other], Console(width=400))
+    assert "trained differently: seed; the merged run states those of" in capsys.readouterr().out
+    assert padgs.load_run(path, device="cpu").result.variant == "2 blocks mixed, continued"
+    moved = shutil.copytree(parts[0].parent, tmp_path / "moved" / "rooms-blocks", symlinks=True)
+    shutil.copytree(parts[0].parent.with_name("rooms"), tmp_path / "moved" / "rooms")
+    shutil.rmtree(path)
+    path = merge([runs[0], other], Console(quiet=True), data=str(moved))
+    assert padgs.load_run(path, device="cpu").config.data.path == str(tmp_path / "moved" / "rooms")
+
+
+def test_the_source_is_found_through_links(source, tmp_path, monkeypatch):
+    """Blocks below a link, trained by their real place; `merge` finds the source and a mask named from elsewhere."""
+    real = tmp_path / "disk" / "deep"
+    shutil.copytree(source, tmp_path / "rooms")
+    real.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(real)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    Image.new("L", (32, 16), 255).save("elsewhere/all.png")
+    settings = ["--blocks", "2", "--to", "link/parts", "--mask", "elsewhere/all.png"]
+    done = CliRunner().invoke(app, ["split", "rooms", *settings])
+    assert done.exit_code == 0, done.output
+    runs = [trained(real / "parts" / f"rooms-block-{number}", tmp_path / "runs") for number in (1, 2)]
+    monkeypatch.chdir(source)
+    merged = padgs.load_run(merge(runs, Console(quiet=True)), device="cpu")
+    assert merged.config.data.path == str(tmp_path / "rooms")
+    assert all(view.mask() is not None for view in merged.scene.train)
 
 
 def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
@@ -162,7 +197,7 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
     assert "block 1 of 2 has several runs" in error(*runs, runs[0])
     assert "whose parts share parameters" in error(trained(parts[0], tmp_path, "method=padgs"), runs[1])
     assert "has other settings of method" in error(runs[0], trained(parts[1], tmp_path, "method.sh_degree=1"))
-    assert "is of no block" in error(trained(source, tmp_path), runs[1])
+    assert "name the folder of the blocks with --data" in error(trained(source, tmp_path), runs[1])
     copy = shutil.copytree(runs[0], tmp_path / "copy")
     results.write(replace(results.read(copy / "result.json"), status="nan", reason="x"), copy)
     assert "did not end well" in error(str(copy), runs[1])

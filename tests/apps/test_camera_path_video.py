@@ -133,11 +133,12 @@ def test_written_depths_can_be_read_as_depth_maps(npy, tmp_path):
     depth = 5 * torch.rand(32, 64)
     shown = SimpleNamespace(image=SHOWN.image, depth=depth)
     origin, options = torch.tensor([10.0, 0.0, 0.0]), {"fps": 10, "scene_scale": 2.5, "depth": True, "npy": npy}
-    write_video(tmp_path / "a", [VIEW], lambda view: shown, origin=origin, **options)
-    stated = json.loads((tmp_path / "a-depth" / "depth.json").read_text())
+    (tmp_path / "a.1").mkdir()  # a dot in the name of a folder begins no suffix
+    write_video(tmp_path / "a.1", [VIEW], lambda view: shown, origin=origin, **options)
+    stated = json.loads((tmp_path / "a.1-depth" / "depth.json").read_text())
     assert stated["measure"] == "ray" and stated["unit"] == (1 if npy else 0.0025)
     assert np.linalg.inv(stated["frames"]["00001"]["cam_from_world"])[:3, 3].tolist() == [10, 0, 0]
-    found = read_depth(next((tmp_path / "a-depth").glob("00001.*"))) * stated["unit"]
+    found = read_depth(next((tmp_path / "a.1-depth").glob("00001.*"))) * stated["unit"]
     np.testing.assert_allclose(found, depth, atol=0 if npy else 0.00126)
 
 
@@ -170,6 +171,9 @@ def test_a_folder_with_images_is_refused(folder, tmp_path):
     arguments = (str(folder), "--to", str(tmp_path / "f"), "--seconds", "0.1", "--fps", "20")
     assert render(*arguments).exit_code == 0
     assert "already holds images" in render(*arguments).stderr
+    result = render(*arguments, "--to", str(tmp_path / ".mp4"))
+    assert result.exit_code == 1 and ".mp4 has no name before its suffix; name the video" in result.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"f"}
 
 
 def test_errors_name_the_option_for_output_and_data(folder, tmp_path):

@@ -42,6 +42,33 @@ def test_whole_numbers_out_of_range_are_refused(option, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        *((f"{name} @", "run") for name in ("export", "render", "smallest", "view")),
+        *((f"{name} run --data @", "data") for name in ("export", "render", "smallest", "view")),
+        ("render run --path @", "path"),
+        ("merge @ run", "runs"),
+        ("split @ --blocks 2", "source"),
+        ("convert @ there --to colmap", "source"),
+        ("convert here @ --to colmap", "destination"),
+        ("prepare @ there", "source"),
+        ("check @", "path"),
+        ("check here --format @", "format"),
+        ("track @", "runs"),
+        ("report all @", "runs"),
+        ("score file.ply --data @", "data"),
+        ("score file.ply --data here --to @", "to"),
+    ],
+)
+def test_empty_texts_are_refused(line, name, tmp_path, monkeypatch):
+    """As of a variable of the shell that is not set."""
+    monkeypatch.chdir(tmp_path)
+    done = run(*(word.replace("@", "") for word in line.split()))
+    assert done.exit_code == 1 and f"error: {name} is empty (is a variable of the shell unset?)" in done.output
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
     ("option", "rule"),
     [
         ("prepare SOURCE OUT --per-second", "it must be from 0.001 to 1000"),

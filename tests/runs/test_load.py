@@ -2,11 +2,14 @@
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from rich.console import Console
+from support.fixtures import make_world, write_colmap_text
 from support.tiny_run import tiny_run
 
 import padgs
@@ -15,8 +18,10 @@ from padgs.data.camera_paths import PATHS
 from padgs.data.capture import DataError
 from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
+from padgs.multirun.composition import composing, configuration
 from padgs.results import read
 from padgs.runs.load import missing_backends
+from padgs.runs.run import run as train
 from padgs.runs.store import RunFolderError, config_hash
 
 
@@ -159,6 +164,22 @@ def test_changed_data_warn_when_shown_and_are_refused_when_compared(folder):
     with pytest.warns(UserWarning, match="was trained on other data than the generator holds"):
         assert run.scene.train
     with pytest.raises(DataError, match="pass the right folder with --data"):
+        run.refuse_other_data()
+
+
+def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, monkeypatch):
+    (tmp_path / "work" / "here").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "work")
+    write_colmap_text(make_world(), tmp_path / "work" / "photographs")
+    with composing():
+        options = ["data.path=photographs", "data.format=colmap", "data.width=32", "train.iterations=2", "method=omnigs"]
+        config = configuration([*options, "protocol=sphere", "protocol.sphere.lpips=none", "tracking=none"])
+    trained = Path("runs", train(config, Console(quiet=True)).run).absolute()
+    assert padgs.load_run(trained, device="cpu").config.data.path == "photographs", "as it was given"
+    for folder in (tmp_path, tmp_path / "work" / "here", Path("/")):
+        monkeypatch.chdir(folder)
+        run = padgs.load_run(trained, device="cpu")
+        assert run.scene.fingerprint == run.result.fingerprint
         run.refuse_other_data()
 
 

@@ -26,21 +26,24 @@ from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
+RUINED = 0.05  # share of Gaussians that a format may move by more than their size
 MAX_LOGIT = 30.0  # formats of 8 bits hold opacities of exactly 0 and 1, whose logits are infinite
 _POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*_POSITION, *_COLOR, *_LAST)
 
 
-def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> None:
+def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> str:
     """Write Gaussians to a .ply or a format of `CONVERTED`, chosen by the suffix; only active harmonics are written.
 
-    `comments` are of a PLY header, `start` [2, 3] is the initial position and target of the viewer in an .html.
+    `comments` are of a PLY header, `start` [2, 3] is the initial position and target of the viewer in an .html. Returns
+    what the format's numbers are too coarse for, if anything; where they do not hold the scene, it is a ValueError.
     """
     check_suffix(path)
     if not path.name.lower().endswith(CONVERTED):
         _write_ply(path, splats, comments)
-        return
+        return ""
+    lost = ""
     with draft_of(path.with_name(f"{path.name}-parts")) as folder:  # as large as the model
         folder.mkdir()
         plain = folder / "splats.ply"
@@ -53,10 +56,35 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
             viewer = {"camera": camera, "background": {"color": [0, 0, 0]}, "animTracks": []}
             (folder / "viewer.json").write_text(json.dumps(viewer))
             settings = ["--viewer-settings", str(folder / "viewer.json")]
+        made = folder / f"made{path.name}"
         try:
-            _convert(plain, path, *settings)
+            _convert(plain, made, *settings)
         except ValueError as error:
             raise ValueError(f"{path} cannot be written ({error}); name another place, or write a .ply") from error
+        if path.suffix.lower() != ".html":
+            lost = _lost(splats, read_splats(made), path)
+        check_place(path)
+        os.replace(made, path)
+    return lost
+
+
+def _lost(splats: Splats, written: Splats, path: Path) -> str:
+    """Return how many Gaussians a format of few bits moved by more than their size; a ValueError if it ruins them."""
+    from scipy.spatial import KDTree
+
+    means, size = splats.means.detach().cpu().double(), splats.log_scales.detach().exp().amax(1).cpu().double()
+    distance = torch.from_numpy(KDTree(written.means.detach().double().numpy()).query(means.numpy())[0])
+    moved = distance > size
+    if not moved.any():
+        return ""
+    text = f"{int(moved.sum())} of {len(splats)} Gaussians by more than their size, one by {distance.max():.3g} units"
+    if moved.double().mean() > RUINED or (moved & (distance > splats.scene_scale)).any():
+        low, high = means.abs().max(), size.median()
+        raise ValueError(
+            f"{path} would move {text}: its numbers do not suit a world in which Gaussians of {high:.2g} units reach "
+            f"{low:.3g} units from the origin; write a .ply or .sog"
+        )
+    return f"the format moved {text}"
 
 
 def _convert(source: Path, target: Path, *more: str) -> None:
@@ -80,6 +108,8 @@ def check_suffix(path: Path) -> None:
     """Raise a ValueError early for an unknown suffix, or if the converter that it needs is not installed."""
     if not path.name.lower().endswith((".ply", *CONVERTED)):
         raise ValueError(f"{path} has an unknown format; known: .ply, {', '.join(CONVERTED)}")
+    if path.name.lower() in (".ply", *CONVERTED):
+        raise ValueError(f"{path} has no name before its suffix; name the file, such as {path.with_name('room.ply')}")
     if path.name.lower().endswith(CONVERTED) and shutil.which(CONVERTER) is None:
         raise ValueError(
             f"writing {path.name} needs {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "

@@ -69,6 +69,8 @@ def test_invalid_files_are_refused(tmp_path, generator):
     splats = random_splats(0, generator)
     with pytest.raises(ValueError, match=r"a.obj has an unknown format; known: .ply, .compressed.ply"):
         write_splats(tmp_path / "a.obj", splats)
+    with pytest.raises(ValueError, match=r"\.ply has no name before its suffix; name the file, such as .*/room\.ply"):
+        write_splats(tmp_path / ".ply", splats)
     write_ply(tmp_path / "cloud.ply", Cloud(torch.zeros(2, 3), None))
     with pytest.raises(DataError, match="has no property f_dc_0; Gaussians of 3DGS have x, y, z"):
         read_splats(tmp_path / "cloud.ply")
@@ -115,6 +117,48 @@ def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
     nearest = torch.cdist(splats.means, back.means).min(dim=1)
     assert nearest.values.max() < 1e-3
     assert torch.allclose(back.log_scales[nearest.indices], splats.log_scales, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("world", "moved", "said"),
+    [
+        (1.0, 0, ""),
+        (1.0, 1, "the format moved 1 of 40 Gaussians by more than their size, one by "),
+        (1.0, 9, "would move 9 of 40 Gaussians by more than their size"),
+        (1e4, 0, "would move 4?[0-9] of 40 Gaussians .* reach .* units from the origin; write a .ply or .sog"),
+        (1e-5, 0, "would move 4?[0-9] of 40 Gaussians"),
+    ],
+)
+def test_gaussians_that_a_format_cannot_hold_are_counted_or_refused(
+    world, moved, said, tmp_path, generator, monkeypatch
+):
+    """As .spz: 24 bits a coordinate in steps of 1/4096 unit, so that 2048 units from the origin it starts again."""
+    splats = random_splats(0, generator)
+    splats.load({name: torch.cat([rows] * 40)[:40] for name, rows in splats.rows().items()})
+    with torch.no_grad():
+        splats.means.copy_(world * torch.randn(40, 3, generator=generator))
+        splats.log_scales.fill_(math.log(0.1 * world))
+    splats.scene_scale = 2.0 * world
+
+    def convert(source, target, *_):
+        vertex = PlyData.read(str(source))["vertex"].data.copy()
+        if target.suffix == ".spz":
+            for axis in "xyz":
+                steps = np.round(vertex[axis].astype(float) * 4096).astype(np.int64)
+                vertex[axis] = ((steps + 2**23) % 2**24 - 2**23) / 4096
+            vertex["x"][:moved] += np.float32(0.5 * world)
+        PlyData([PlyElement.describe(vertex, "vertex")]).write(str(target))
+
+    monkeypatch.setattr(splat_file, "check_suffix", lambda path: None)  # where the converter is missing
+    monkeypatch.setattr(splat_file, "_convert", convert)
+    path = tmp_path / "a.spz"
+    if "would" in said:
+        with pytest.raises(ValueError, match=said):
+            write_splats(path, splats)
+        assert not path.exists()
+    else:
+        assert write_splats(path, splats).startswith(said) and len(read_splats(path)) == 40
+        assert (said == "") == (write_splats(path, splats) == "")
 
 
 @pytest.fixture
