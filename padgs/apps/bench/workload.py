@@ -33,7 +33,6 @@ NEVER = 1 << 40  # iterations
 LEAST = (1e-30, 1e-30)  # a learning rate that changes no float32, for schedules that cannot be 0
 STILL = LearningRates(
     offset_rate=LEAST,
-    offset_rate_unit="scene",
     feature_rate=0.0,
     log_scale_rate=0.0,
     **dict.fromkeys(("opacity_rate", "color_rate", "covariance_rate"), LEAST),

