@@ -273,10 +273,11 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
     folder = _folder_of(first).resolve()
     whole = {"path": os.path.normpath(folder / block["source"]), "format": block["format"], **block["options"]}
     together = hashlib.sha256("".join(run.digest for run in runs).encode()).hexdigest()
+    blocks = f"{block['count']} blocks{' mixed' if differing else ''}"
     config = replace(
         first.config,
         data=replace(first.config.data, **whole),
-        variant=", ".join(filter(None, (first.config.variant, f"{block['count']} blocks" + " mixed" * bool(differing)))),
+        variant=", ".join(filter(None, (first.config.variant, blocks))),
         init=WarmStart(" ".join(str(run.folder) for run in runs), together),
     )
     scene = load_scene(config, start(config))
@@ -329,8 +330,8 @@ def _block_of(run: LoadedRun) -> dict[str, Any]:
     folder = _folder_of(run)
     if run.config.data.path is None or not (folder / BLOCK).is_file():
         raise ValueError(
-            f"{run.folder} is of no block: {folder / BLOCK} is missing; train what padgs split wrote, or if it has moved, "
-            "name the folder of the blocks with --data"
+            f"{run.folder} is of no block: {folder / BLOCK} is missing; train what padgs split wrote, or, if it has "
+            "moved, name the folder of the blocks with --data"
         )
     block = json.loads((folder / BLOCK).read_text())
     if hashlib.sha256((folder.parent / REGIONS).read_bytes()).hexdigest() != block.get("regions"):

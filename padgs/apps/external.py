@@ -18,7 +18,7 @@ import torch
 
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import CONVERTED, read_splats
-from padgs.apps.frame_check import Draw, FrameCheck, check_frame, nerfstudio_similarity, read_transform
+from padgs.apps.frame_check import FrameCheck, check_frame, nerfstudio_similarity, read_transform
 from padgs.checks import unknown
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.path_file import TRANSFORMS
@@ -39,7 +39,6 @@ from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import initial_result, load_scene
 from padgs.runs.store import Labels, RunStore
 from padgs.scene import Scene, View
-from padgs.training.method import Method
 
 METHOD = "external"  # name in results
 SPLATS = (".ply", *(suffix for suffix in CONVERTED if suffix != ".html"))
@@ -167,19 +166,12 @@ class ExternalRun(LoadedRun):
         splats = self.method.model.splats
         opaque = splats.means[torch.sigmoid(splats.opacity_logits) >= OPAQUE].detach()
 
-        def drawing(method: Method) -> Draw:  # moves the camera, not the Gaussians
-            def draw(moved: Similarity, view: View) -> Rendering:
-                return method.render(view.at(moved.inverse().pose(view.cam_from_world).to(view.cam_from_world)))
-
-            return draw
-
         known, nerfstudio = self.folder.parent / TRANSFORMS, None
         if known.is_file():
             shift = Similarity(translation=-self.scene.origin.double().cpu())
             nerfstudio = shift @ nerfstudio_similarity(known, _transforms_json(self.config))
-        settings = {name: rays for name, rays in RAYS.items() if rays != self.config.render}
-        others = {name: drawing(self.method.with_renderer(rays)) for name, rays in settings.items()}
-        found = check_frame(self.scene, drawing(self.method), opaque, nerfstudio, others)
+        others = {name: self.method.with_renderer(rays).render for name, rays in RAYS.items()}
+        found = check_frame(self.scene, self.method.render, opaque, nerfstudio, others)
         if found.suggestion is None:
             return found
         return replace(found, suggestion=self.world.inverse() @ found.suggestion @ self.world @ self.given)

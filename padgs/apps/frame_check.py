@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -15,12 +15,10 @@ from torch import Tensor
 
 from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
 from padgs.evaluation.metrics import mean_color, sphere_weight, ws_psnr
-from padgs.evaluation.scoring import ONE_COLOR
+from padgs.evaluation.scoring import ONE_COLOR, Render
 from padgs.geometry.similarity import Similarity
-from padgs.render import Rendering
 from padgs.scene import Scene, View
 
-Draw = Callable[[Similarity, View], Rendering]  # a view, with the Gaussians moved
 IDENTITY = "identity"
 WIDTH, VIEWS, SEARCHED = 128, 4, 2  # of the low-resolution renders; views of the search for another world
 MARGIN, LEAST = 3.0, 1.0  # dB above one colour per view: in the right world for sure; if no other world is better
@@ -93,7 +91,7 @@ def as_numbers(similarity: Similarity) -> str:
 
 @dataclass(frozen=True)
 class FrameCheck:
-    """PSNR of low-resolution renders of training views, and better rays, or a better world if the file's does not fit."""
+    """PSNR of low-resolution renders of training views; if that is low, better rays, or a better world of the file."""
 
     psnr: float
     one_color: float  # PSNR of the mean colour of each view
@@ -121,15 +119,15 @@ class FrameCheck:
 
 def check_frame(
     scene: Scene,
-    render: Draw,
+    render: Render,
     means: Tensor,
     nerfstudio: Similarity | None = None,
-    others: Mapping[str, Draw] = MappingProxyType({}),
+    others: Mapping[str, Render] = MappingProxyType({}),
 ) -> FrameCheck:
     """Render training views at a low resolution; if they do not fit, try `others`, and search for a better world.
 
-    `render`, and `others` by the name of their rays, draw a view with the Gaussians under scene_from_file, `means` [N, 3] are the opaque ones in the file's
-    world; `nerfstudio` is the scene_from_file of nerfstudio's `dataparser_transforms.json`, if there is one.
+    `render`, and `others` by the name of their rays, draw a view; `means` [N, 3] are those of the opaque Gaussians;
+    `nerfstudio` is the scene_from_file of nerfstudio's `dataparser_transforms.json`, if there is one.
     """
     views = [view for view in scene.train if view.lens is None]
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
@@ -141,9 +139,10 @@ def check_frame(
         return FrameCheck(float("inf"), 0.0)
     truths, flat = [truths[index] for index in compared], mean(constants[index] for index in compared)
 
-    def quality(scene_from_file: Similarity, count: int = VIEWS, draw: Draw = render) -> float:
+    def quality(scene_from_file: Similarity, count: int = VIEWS, draw: Render = render) -> float:
+        back = scene_from_file.inverse()  # moves the camera, not the Gaussians
         marks = [
-            ws_psnr(draw(scene_from_file, view).image.clamp(0, 1).to(truth), truth, mask)
+            ws_psnr(draw(view.at(back.pose(view.cam_from_world))).image.clamp(0, 1).to(truth), truth, mask)
             for view, truth, mask in truths[:count]
         ]
         return torch.stack(marks).mean().item()

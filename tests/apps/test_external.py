@@ -22,7 +22,7 @@ from padgs.apps import external
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
-from padgs.apps.frame_check import _closest_points, _worlds, as_numbers, read_transform
+from padgs.apps.frame_check import _closest_points, _worlds, as_numbers, check_frame, read_transform
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
@@ -107,9 +107,10 @@ def test_renders_in_a_folder_score_like_their_run(run, tmp_path):
     assert not (tmp_path / "damaged").exists()
     shutil.copy(folder / "cover.png", folder / f"{view.name}.png")
     said = padgs_command("score", folder, "--data", run)[1]
-    assert f"{view.name}.png is 2x1; the test view is 64x32: render that size, or compare at --width 2, with the" in said
+    assert f"{view.name}.png is 2x1; the test view is 64x32: render that size, or compare at --width 2, with" in said
     Image.new("RGB", (192, 32)).save(folder / f"{view.name}.png")  # truth | render | error
-    assert "192x32; the test view is 64x32: render that size" in (said := padgs_command("score", folder, "--data", run)[1])
+    said = padgs_command("score", folder, "--data", run)[1]
+    assert "192x32; the test view is 64x32: render that size" in said
     assert "--width" not in said
     Image.new("RGBA", (64, 32)).save(folder / f"{view.name}.png")
     assert "has pixels of type RGBA" in padgs_command("score", folder, "--data", run)[1]
@@ -130,29 +131,19 @@ def test_a_file_in_another_world_is_refused_with_the_transform_that_mends_it(run
     assert the_result(tmp_path).scores["sphere"].metrics["ws_psnr"] == pytest.approx(own["ws_psnr"], abs=1e-3)
 
 
-def test_rays_that_suit_a_file_are_named(run, splats, tmp_path, monkeypatch):
+def test_rays_that_suit_a_file_are_named(run, splats):
     """A model that was trained with a low-pass has Gaussians thinner than a pixel: exact rays show few of them."""
     opened = open_model(str(splats), str(run), device="cpu")
     assert opened.check().fits and not opened.check().rays, "exact rays show it"
-    monkeypatch.setitem(external.RAYS, "ewa", opened.method.render_config)
     thin = read_splats(splats)
     with torch.no_grad():
         thin.log_scales -= 12
-    write_splats(tmp_path / "a.ply", thin)
-    method = ExternalMethod.with_renderer
-
-    def wide(self, render):
-        other = method(self, render)
-        with torch.no_grad():
-            other.model.splats.log_scales += 12
-        return other
-
-    monkeypatch.setattr(ExternalMethod, "with_renderer", wide)
-    monkeypatch.setitem(external.RAYS, "exact", replace(RAYS["exact"], low_pass=1e-6))
-    monkeypatch.setitem(external.RAYS, "ewa", replace(RAYS["exact"], low_pass=2e-6))
-    code, output = padgs_command("score", tmp_path / "a.ply", "--data", run, "--to", tmp_path)
-    assert code == 1 and "dB with --rays ewa, as it was trained: add that" in output, output
-    assert "not in the world" not in output and not list(tmp_path.glob("*/"))
+    exact, scene = ExternalMethod.of(thin, RAYS["exact"]), opened.scene
+    found = check_frame(scene, exact.render, thin.means.detach(), others={"ewa": opened.method.render})
+    assert found.rays == "ewa" and not found.fits
+    assert "dB with --rays ewa, as it was trained: add that" in str(found) and "not in the world" not in str(found)
+    found = check_frame(scene, exact.render, thin.means.detach()[:0], others={"ewa": exact.render})
+    assert not found.rays and "not in the world of the scene" in str(found)
 
 
 def test_nerfstudio_s_world_is_suggested(run, splats, tmp_path):

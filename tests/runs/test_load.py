@@ -172,8 +172,8 @@ def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, mon
     monkeypatch.chdir(tmp_path / "work")
     write_colmap_text(make_world(), tmp_path / "work" / "photographs")
     with composing():
-        options = ["data.path=photographs", "data.format=colmap", "data.width=32", "train.iterations=2", "method=omnigs"]
-        config = configuration([*options, "protocol=sphere", "protocol.sphere.lpips=none", "tracking=none"])
+        options = ["data.path=photographs", "data.format=colmap", "data.width=32", "protocol=sphere", "tracking=none"]
+        config = configuration([*options, "protocol.sphere.lpips=none", "train.iterations=2", "method=omnigs"])
     trained = Path("runs", train(config, Console(quiet=True)).run).absolute()
     assert padgs.load_run(trained, device="cpu").config.data.path == "photographs", "as it was given"
     for folder in (tmp_path, tmp_path / "work" / "here", Path("/")):
