@@ -189,8 +189,7 @@ def _found(path: str | None, run: Path) -> str | None:
     """Return a path of a run's data from here; if nothing is there, as seen from a folder above the run."""
     if path is None or os.path.exists(path):
         return path
-    above = (str(folder / path) for folder in run.absolute().parents)
-    return next(filter(os.path.exists, above), path)  # training began there
+    return next(filter(os.path.exists, (str(above / path) for above in run.absolute().parents)), path)
 
 
 def missing_backends(device: str) -> set[str]:

@@ -26,7 +26,7 @@ ANCHORS = tuple(
     f"method.{name}={value}"
     for name, value in {
         **{"statistics_from": 0, "grow_from": 1, "grow_until": 26_250, "grow_every": 2},
-        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]", "offset_rate_unit": "scene", "voxel_pixels": 3},
+        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]", "voxel_pixels": 3},
     }.items()
 )
 # setting -> overrides that make it small, and grow; how often the host waits in an iteration without growth or

@@ -79,11 +79,8 @@ def _lost(splats: Splats, written: Splats, path: Path) -> str:
         return ""
     text = f"{int(moved.sum())} of {len(splats)} Gaussians by more than their size, one by {distance.max():.3g} units"
     if moved.double().mean() > RUINED or (moved & (distance > splats.scene_scale)).any():
-        low, high = means.abs().max(), size.median()
-        raise ValueError(
-            f"{path} would move {text}: its numbers do not suit a world in which Gaussians of {high:.2g} units reach "
-            f"{low:.3g} units from the origin; write a .ply or .sog"
-        )
+        sizes = f"Gaussians of {size.median():.2g} units reach {means.abs().max():.3g} units from the origin"
+        raise ValueError(f"{path} would move {text}: its numbers do not suit a world in which {sizes}; write a .ply")
     return f"the format moved {text}"
 
 

@@ -23,7 +23,7 @@ from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.options import AUTO, Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS, Constant, LogLinear, ParameterGroup
 
-OFFSET_RATE_UNITS = ("anchor", "scene", "world")
+OFFSET_RATE_UNITS = ("anchor", "world")
 LENGTHS = ("voxel_size", "scene_scale", "unit")  # attributes of the anchors in a state
 HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
 
@@ -32,10 +32,8 @@ HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
 class LearningRates(ExtentOptions):
     """Learning rates of Adam; pairs are start and end of a log-linear decay over the run."""
 
-    # Offsets are multiples of their anchor's scale, so no length belongs to their rate: docs/notes/padgs_paper.md.
-    offset_rate: tuple[float, float] = (0.05, 0.0005)
-    # anchor: the rate as it is | times the camera extent: scene, in `Scene.scale`, or world (released, 0.01 and 0.0001)
-    offset_rate_unit: str = "anchor"
+    offset_rate: tuple[float, float] = (0.05, 0.0005)  # of offsets, which are multiples of their anchor's scale
+    offset_rate_unit: str = "anchor"  # the rate as it is | world: times the camera extent (released, 0.01 and 0.0001)
     feature_rate: float = 0.0075  # learning rate of anchor features
     log_scale_rate: float = 0.007  # learning rate of anchor scales
     opacity_rate: tuple[float, float] = (0.002, 2e-5)  # first and last rate of the opacity network
@@ -198,8 +196,7 @@ class PaDGSMethod(Method):
             raise ValueError("budget.gaussians is auto, which prunes Gaussians, but PaD-GS has anchors; set a number")
 
     def build_model(self, scene: Scene, iterations: int) -> AnchorModel:
-        unit = self.options.offset_rate_unit
-        extent = 1.0 if unit == "anchor" else self.options.extent_of(scene) / (scene.scale if unit == "scene" else 1.0)
+        extent = self.options.extent_of(scene) if self.options.offset_rate_unit == "world" else 1.0
         anchors = PaDGS.from_scene(scene, self.options, seed=self.seed)
         is_new = self._warm_start_state is None and self._loaded_state is None
         if is_new and isinstance(self._gaussians, int) and self._gaussians < len(anchors):

@@ -125,7 +125,7 @@ def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
         (1.0, 0, ""),
         (1.0, 1, "the format moved 1 of 40 Gaussians by more than their size, one by "),
         (1.0, 9, "would move 9 of 40 Gaussians by more than their size"),
-        (1e4, 0, "would move 4?[0-9] of 40 Gaussians .* reach .* units from the origin; write a .ply or .sog"),
+        (1e4, 0, "would move 4?[0-9] of 40 Gaussians .* reach .* units from the origin; write a .ply"),
         (1e-5, 0, "would move 4?[0-9] of 40 Gaussians"),
     ],
 )

@@ -137,10 +137,8 @@ def test_published_learning_rates():
     ("unit", "views", "rate"),
     [
         ("anchor", 1, lambda alone: 0.05),
-        ("scene", 1, lambda alone: 0.05 * EAGER.min_extent),
         ("world", 1, lambda alone: 0.05 * EAGER.min_extent * alone.scale),
         ("anchor", 2, lambda pair: 0.05),
-        ("scene", 2, lambda pair: 0.05 * pair.extent / pair.scale),
         ("world", 2, lambda pair: 0.05 * pair.extent),
     ],
 )
