@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Format = "auto",
-    overlay: Annotated[
-        str | None, typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none")
-    ] = None,
+    overlay: Annotated[str, typer.Option(help="file for points on a panorama, or none; default: beside the data")] = "",
     mask: Mask = "auto",
     depth: Depth = "auto",
     images: Images = "",
@@ -28,8 +26,8 @@ def check(
     """Check a data set and list its problems. Exit code 1 if there are any."""
     from rich.console import Console
 
-    if overlay and Path(overlay).suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise ValueError(f"--overlay {overlay} is no .png or .jpg; choose another name, or '' for none")
+    if overlay not in ("", "none") and Path(overlay).suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ValueError(f"--overlay {overlay} is no .png or .jpg; choose another name, or none")
     from padgs.data.capture import DataOptions
     from padgs.data.check import check as look_through
 
@@ -38,7 +36,7 @@ def check(
             Path(path),
             format=format,
             options=DataOptions(mask=mask, depth=depth, images=images or None, split=split),
-            overlay=overlay_path(Path(path)) if overlay is None else Path(overlay) if overlay else None,
+            overlay=None if overlay == "none" else Path(overlay) if overlay else overlay_path(Path(path)),
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )
     end_with(report)

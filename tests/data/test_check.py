@@ -150,11 +150,11 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert run(app, ["check", str(folder)]).exit_code == 0
     assert (folder / "check.png").is_file() and not (tmp_path / "check.png").exists()
     (folder / "images/pano_02.png").unlink()
-    bad = run(app, ["check", str(folder), "--overlay", ""])
+    bad = run(app, ["check", str(folder), "--overlay", "none"])
     assert (
         bad.exit_code == 1 and "PROBLEM" in bad.output and "pano_02.png" in bad.output and "1 problem(s)" in bad.output
     )
-    assert run(app, ["check", str(tmp_path / "absent"), "--overlay", ""]).exit_code == 1
+    assert run(app, ["check", str(tmp_path / "absent"), "--overlay", "none"]).exit_code == 1
     assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).stderr
 
 
