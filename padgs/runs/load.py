@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -165,7 +165,9 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     try:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
         run = {"configuration": config_hash(values)}  # the data are not read
-        values["data"]["path"] = _found(values["data"]["path"], store.path) if data_path is None else str(data_path)
+        source, above = values["data"], (Path(), *store.path.absolute().parents)  # training began in one of these
+        source["path"] = _found(source["path"], above) if data_path is None else str(data_path)
+        source |= {key: _found(source[key], (Path(source["path"] or ""), *above)) for key in ("points", "mask")}
         values["run"]["device"] = device
         if values["render"]["backend"] in missing_backends(device):
             values["render"]["backend"] = "auto"
@@ -185,11 +187,9 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     return LoadedRun(store.path, config, method, store.result(), iteration, digest)
 
 
-def _found(path: str | None, run: Path) -> str | None:
-    """Return a path of a run's data from here; if nothing is there, as seen from a folder above the run."""
-    if path is None or os.path.exists(path):
-        return path
-    return next(filter(os.path.exists, (str(above / path) for above in run.absolute().parents)), path)
+def _found(path: str | None, folders: Iterable[Path]) -> str | None:
+    """Return a path within the first of some folders that has it; as it is if none has, as for keywords."""
+    return next((str(folder / path) for folder in folders if path and (folder / path).exists()), path)
 
 
 def missing_backends(device: str) -> set[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from PIL import Image
 from rich.console import Console
 from support.fixtures import make_world, write_colmap_text
 from support.tiny_run import tiny_run
@@ -171,8 +172,16 @@ def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, mon
     (tmp_path / "work" / "here").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "work")
     write_colmap_text(make_world(), tmp_path / "work" / "photographs")
+    Image.new("L", (64, 32), 255).save("all.png")
     with composing():
-        options = ["data.path=photographs", "data.format=colmap", "data.width=32", "protocol=sphere", "tracking=none"]
+        options = [
+            "data.mask=all.png",
+            "data.path=photographs",
+            "data.format=colmap",
+            "data.width=32",
+            "protocol=sphere",
+            "tracking=none",
+        ]
         config = configuration([*options, "protocol.sphere.lpips=none", "train.iterations=2", "method=omnigs"])
     trained = Path("runs", train(config, Console(quiet=True)).run).absolute()
     assert padgs.load_run(trained, device="cpu").config.data.path == "photographs", "as it was given"
@@ -181,6 +190,7 @@ def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, mon
         run = padgs.load_run(trained, device="cpu")
         assert run.scene.fingerprint == run.result.fingerprint
         run.refuse_other_data()
+        assert all(view.mask() is not None for view in run.scene.train)
 
 
 def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
