@@ -147,7 +147,11 @@ def _is_value(stored: Any, text: str) -> bool:
 
     >>> _is_value(60.0, "60"), _is_value(True, "true"), _is_value("room", "rooms")
     (True, True, False)
+    >>> _is_value(float("nan"), "null"), _is_value(None, "None")
+    (True, True)
     """
+    if stored is None or stored != stored:
+        return text.casefold() in ("null", "none")
     with suppress(ValueError):
         if isinstance(stored, (int, float)) and not isinstance(stored, bool):
             return float(text) == stored
@@ -163,29 +167,37 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
         runs = runs.loc[[any(map(request.matches, of)) for of in runs["experiments"]]]
     where = dict(request.where)
-    chosen = {
-        ("preset", "method"): (*request.methods, *filter(None, [where.pop("method", "")])),
-        ("scene", "dataset"): (*request.scenes, *filter(None, [where.pop("scene", "")])),
-    }
-    for columns, patterns in chosen.items() if len(every) else ():
+    stated = {name: tuple(filter(None, where.pop(name, "").split(","))) for name in ("method", "scene")}
+    chosen = [("preset", "method", request.methods), ("scene", "dataset", request.scenes)]
+    chosen += [("preset", "method", stated["method"]), ("scene", "dataset", stated["scene"])]
+    for *columns, patterns in chosen if len(every) else ():
         if patterns:
-            own = [_is_one_of(names, patterns) for names in runs[list(columns)].itertuples(index=False)]
-            if not any(own):
+            own = [_is_one_of(names, patterns) for names in runs[columns].itertuples(index=False)]
+            if lost := _unmatched(every[columns], patterns) or ([] if any(own) else patterns):
                 known = ", ".join(sorted(every[columns[0]].unique()))
                 name = columns[0].replace("preset", "method")
-                raise ReportError(f"no run has {name} {', '.join(patterns)}; runs have {known}")
+                raise ReportError(f"no run has {name} {', '.join(lost)}; runs have {known}")
             runs = runs.loc[own]
     for key, value in where.items() if len(every) else ():
         column = f"{CONFIG}{key}"
-        if column not in every or every[column].isna().all():
+        if column not in every:
             first = every.iloc[0]
             keys = [name.removeprefix(CONFIG) for name in first.index[first.notna()] if name.startswith(CONFIG)]
             raise ReportError(f"unknown key {key!r}; known in run {first['run']}: {', '.join(keys)}")
         runs = runs.loc[[_is_value(stored, value) for stored in runs[column]]]
         if runs.empty:
-            values = ", ".join(sorted(set(every[column].dropna().map(str))))
+            values = ", ".join(
+                sorted({"null" if stored != stored or stored is None else str(stored) for stored in every[column]})
+            )
             raise ReportError(f"no run has {key}={value}; runs have {values}")
     return runs
+
+
+def _unmatched(names: DataFrame, patterns: Iterable[str]) -> list[str]:
+    """Return the patterns that no row of names fits; a name with commas may be given whole and in its parts."""
+    rows = [*names.drop_duplicates().itertuples(index=False)]
+    matching = [pattern for pattern in patterns if any(_is_one_of(row, [pattern]) for row in rows)]
+    return [pattern for pattern in patterns if "," not in pattern and not any(pattern in known for known in matching)]
 
 
 def _is_one_of(names: Collection[str], patterns: Iterable[str]) -> bool:

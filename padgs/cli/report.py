@@ -87,8 +87,8 @@ def report(
 
 def _listed(values: list[str] | None) -> tuple[str, ...]:
     # Names of scenes may have commas, before a space mostly.
-    names = (name for value in values or () for name in (*value.split(","), value if ", " in value else "") if name)
-    return tuple(dict.fromkeys(names))
+    parts = (part.strip() for value in values or () for part in (*value.split(","), value if ", " in value else ""))
+    return tuple(dict.fromkeys(filter(None, parts)))
 
 
 def _pairs(settings: list[str] | None) -> dict[str, str]:

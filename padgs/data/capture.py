@@ -43,6 +43,19 @@ def listed(names: Iterable[object], most: int = 5) -> str:
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
+def by_id(pairs: Iterable[tuple[Any, Any]], where: str) -> dict[Any, Any]:
+    """Return pairs of id and value as a dictionary; a DataError if `where` has an id twice, with different values.
+
+    >>> by_id([(1, "a"), (2, "b"), (1, "a")], "cameras.txt")
+    {1: 'a', 2: 'b'}
+    """
+    found: dict[Any, Any] = {}
+    for key, value in pairs:
+        if str(found.setdefault(key, value)) != str(value):
+            raise DataError(f"{where} has {key!r} twice, with different values; remove one, or export it again")
+    return found
+
+
 def refuse_special(path: Path) -> None:
     """Refuse folders, pipes and devices in place of a file: reading a pipe waits, and some devices never end."""
     if path.exists() and not path.is_file():

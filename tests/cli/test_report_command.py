@@ -114,6 +114,20 @@ def test_scenes_may_have_commas_in_their_names(tmp_path):
     assert done.exit_code == 0 and "Flat, old" in done.output and "synthetic-room" not in done.output
 
 
+def test_each_name_of_a_list_must_fit(tmp_path):
+    found = compared(["synthetic-room", "synthetic-outdoor"], seeds=1)
+    write(found, tmp_path)
+    for scenes in (["synthetic-room, synthetic_outdoor"], ["synthetic_room ,", "*-outdoor"], ["synthetic"]):
+        done = report("runs", tmp_path, *(part for name in scenes for part in ("--scene", name)))
+        assert done.exit_code == 0 and "synthetic-room" in done.output and "synthetic-outdoor" in done.output
+    for wrong in (["synthetic-room,nosuch"], ["synthetic-room", "nosuch"], ["nosuch, synthetic-room"]):
+        done = report("runs", tmp_path, *(part for name in wrong for part in ("--scene", name)))
+        assert done.exit_code == 1 and "no run has scene nosuch; runs have" in done.output
+    preset = found[0].preset
+    done = report("runs", tmp_path, "--method", f"{preset}, padgz")
+    assert done.exit_code == 1 and "no run has method padgz; runs have" in done.output
+
+
 def test_a_missing_folder_is_refused(tmp_path):
     done = report("table3", tmp_path / "none")
     assert done.exit_code == 1 and "there is no folder" in done.output

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from footprint_error import LATITUDES, REFERENCE, SIGMAS, footprint_error
+from support.footprint_error import LATITUDES, REFERENCE, SIGMAS, footprint_error
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "projection_error.md"
 

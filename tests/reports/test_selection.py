@@ -4,7 +4,7 @@ import pytest
 from pandas import DataFrame
 from support.made_up import run_set, small
 
-from padgs.reports.selection import Mixture, one_setting, separate, settings
+from padgs.reports.selection import Mixture, ReportError, Request, one_setting, select, separate, settings
 
 
 def refused(*options) -> tuple[DataFrame, Mixture]:
@@ -47,3 +47,27 @@ def test_settings_of_a_variant_have_different_titles_though_another_variant_has_
     ]
     titles = [setting.title for setting in settings(run_set(runs).runs)]
     assert titles == ["PaD-GS, tau 0.9", "PaD-GS, a1, tau 0.5", "PaD-GS, a1, tau 0.9"]
+
+
+def test_conditions_all_hold():
+    """Names by their option and as a setting; null is a value, also of a key that is null in all runs."""
+    stated = [("padgs", "flat", None), ("padgs", "room", 64), ("spags", "flat", 64), ("spags", "room", None)]
+    found = []
+    for seed, (method, scene, width) in enumerate(stated):
+        config = {"data": {"width": width, "points": None}}
+        found.append(small(25.0, seed=seed, method=method, preset=method, scene=scene, config=config))
+    runs = run_set(found).runs
+
+    def chosen(**asked) -> list[int]:
+        return sorted(select(runs, Request(**asked))["seed"])
+
+    assert chosen(where={"method": "padgs"}) == [0, 1] == chosen(methods=("padgs",))
+    assert chosen(methods=("padgs", "spags"), where={"method": "padgs", "scene": "flat"}) == [0]
+    assert chosen(where={"scene": "flat,room"}) == [0, 1, 2, 3]
+    with pytest.raises(ReportError, match="no run has method spags; runs have padgs, spags"):
+        chosen(methods=("padgs",), where={"method": "spags"})
+    assert chosen(where={"data.width": "null"}) == [0, 3] == chosen(where={"data.width": "None"})
+    assert chosen(where={"data.width": "64"}) == [1, 2]
+    assert chosen(where={"data.points": "null"}) == [0, 1, 2, 3]
+    with pytest.raises(ReportError, match="no run has data.points=5; runs have null"):
+        chosen(where={"data.points": "5"})

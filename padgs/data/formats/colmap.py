@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, listed
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, by_id, listed
 from padgs.data.cloud import first_ply
 from padgs.data.formats import colmap_files as model_files
 from padgs.data.formats.colmap_lens import lens_of, pycolmap_module
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.images import EXTENSIONS
-from padgs.data.splits import check_name
+from padgs.data.splits import check_name, read_lines
 
 PLY = ("points3D.ply", "points3d.ply", "points.ply", "fused.ply")  # in place of the points file
 
@@ -40,8 +40,7 @@ def find_model(path: Path) -> Path | None:
 def _count(file: Path) -> int:
     """Return how many images the images file of a model says that it holds, without reading their poses."""
     if file.suffix == ".txt":
-        with file.open("rb") as lines:
-            return sum(line.strip().lower().endswith(tuple(map(str.encode, EXTENSIONS))) for line in lines)
+        return sum(line.strip().lower().endswith(EXTENSIONS) for line in read_lines(file, "replace"))
     with file.open("rb") as content:
         return int.from_bytes(content.read(8), "little")
 
@@ -64,7 +63,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
             + (", or set data.points to a PLY file or to random" if absent == ["points3D"] else "")
         )
     folder = image_folder(path, options.images)
-    cameras = dict(model_files.read_cameras(files["cameras"]))
+    cameras = by_id(model_files.read_cameras(files["cameras"]), str(files["cameras"]))
     images = sorted(model_files.read_images(files["images"]), key=lambda image: image.id)
     points = model_files.Points({}, colored, frozenset())
     if "points3D" in files:

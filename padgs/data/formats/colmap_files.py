@@ -163,6 +163,8 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
 
 def _fields(file: Path, number: int, fields: list[str], kinds: tuple[type, ...], names: str) -> list[Any]:
     try:
+        if any("_" in field for kind, field in zip(kinds, fields, strict=False) if kind is not str):
+            raise ValueError("Python takes 7_3 for 73, other programs do not")
         return [kind(field) for kind, field in zip(kinds, fields[: len(kinds)], strict=True)]
     except ValueError as error:
         raise DataError(f"{file}, line {number}: {' '.join(fields)[:60]!r} is not {names}; export it again") from error

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.data.capture import DataError, listed
+from padgs.data.capture import DataError, by_id, listed
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_name, is_inside, spellings
 
@@ -98,9 +98,16 @@ def _is_numbers(value: Any) -> bool:
 
 
 def read_json(path: Path) -> Json:
-    """Read a JSON file; a DataError if it cannot be read, or names the line that is not JSON."""
+    """Read a JSON file; a DataError if it cannot be read, has a field twice, or names the line that is not JSON."""
+
+    def fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        return found if len(found) == len(pairs) else by_id(pairs, f"an object of {path}")
+
     try:
-        return Json(json.loads(read_bytes(path)), str(path))
+        return Json(json.loads(read_bytes(path), object_pairs_hook=fields), str(path))
+    except DataError:
+        raise
     except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, huge numbers, deep nesting
         raise DataError(f"{path} is not valid JSON ({error}); export it again") from error
 

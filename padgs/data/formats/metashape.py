@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, UnknownLens, files_with, listed
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, UnknownLens, by_id, files_with, listed
 from padgs.data.cloud import read_ply
 from padgs.data.formats.poses import cam_from_pose, checked_rotation, rigid
 from padgs.data.images import read_bytes
@@ -126,7 +126,8 @@ def _refuse_twins(names: list[str], file: Path) -> None:
 
 def _sensors(chunk: XML.Element, used: set[str], file: Path) -> dict[str, dict[str, Any]]:
     """Return what the used sensors say of a `Frame`, by id: width and height; if not spherical, the lens."""
-    found, sensors = {}, {sensor.get("id", ""): sensor for sensor in chunk.findall("sensors/sensor")}
+    stated = ((sensor.get("id", ""), sensor) for sensor in chunk.findall("sensors/sensor"))
+    found, sensors = {}, by_id(stated, f"<sensors> of {file}")
     for key in sorted(used):
         if key not in sensors:
             raise DataError(f"{file}: cameras use <sensor id={key!r}>, which is not in <sensors>; export them again")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, UnknownLens
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, UnknownLens, by_id
 from padgs.data.cloud import color_bytes, first_ply, whole_if_possible
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center, cam_from_world, rotation_from_vector
@@ -102,10 +102,10 @@ def _mvg_views(data: Json) -> list[MvgView]:
 
 def _mvg_poses(data: Json) -> dict[int, Tensor]:
     """Read the extrinsics: pose key -> cam_from_world [4, 4] float64."""
+    found = [(item["key"].whole(), item["value"].value) for item in data["extrinsics"].entries()]
     poses = {}
-    for item in data["extrinsics"].entries():
-        key = item["key"].whole()
-        pose = Json(item["value"].value, f"extrinsic {key} of {data.where}")
+    for key, value in by_id(found, f"extrinsics of {data.where}").items():
+        pose = Json(value, f"extrinsic {key} of {data.where}")
         poses[key] = cam_from_center(pose["rotation"].numbers(3, 3), pose["center"].numbers(3), pose.where)
     if not poses:
         export = "openMVG_main_ConvertSfM_DataFormat -V -I -E -S"

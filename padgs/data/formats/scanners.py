@@ -41,13 +41,14 @@ def read_navvis(path: Path, options: DataOptions) -> Capture:
     images = image_folder(folder, options.images) if options.images else image_folder(file.parent, None)
     frames = []
     for number, line in lines[1:]:
-        row = next(csv.reader([line], delimiter=mark))
+        row = next(csv.reader([line], delimiter=mark, skipinitialspace=True))
         where = f"{file}, line {number}"
         try:
             fields = dict(zip(names, map(str.strip, row), strict=True))
             values = torch.tensor([float(fields[name]) for name in COLUMNS], dtype=torch.float64)
         except ValueError as error:
-            raise DataError(f"{where}: {mark.join(row)[:60]!r} is not {'; '.join(names)} ({error})") from error
+            what = f"{line.strip()[:60]!r} is not {'; '.join(names)} ({error})"
+            raise DataError(f"{where}: {what}; export the poses again, with decimal points") from error
         name = check_name(fields["filename"], where)
         frames.append(Frame(name, images / name, cam_from_panorama(values[3:], values[:3], where)))
     clouds = [file for suffix in (".ply", ".las", ".laz", ".e57") for file in files_with(folder, suffix)]

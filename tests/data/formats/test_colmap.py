@@ -123,6 +123,37 @@ def test_texts_in_the_unicode_of_windows_and_indented_comments(world: World, tmp
     assert load(tmp_path).fingerprint == before.fingerprint
 
 
+@pytest.mark.parametrize("form", ["utf-16", "CR", "CRLF"])
+def test_the_largest_part_is_used_in_any_form_of_text(form: str, world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    large, few = tmp_path / "sparse" / "0", tmp_path / "sparse" / "1"
+    shutil.copytree(large, few)
+    lines = (large / "images.txt").read_text().splitlines()
+    (few / "images.txt").write_text("\n".join(line for line in lines if "pano_0" not in line or "pano_00" in line))
+    text = (large / "images.txt").read_text()
+    ends = {"CR": "\r", "CRLF": "\r\n"}.get(form, "\n")
+    (large / "images.txt").write_bytes(text.replace("\n", ends).encode("utf-16" if form == "utf-16" else "utf-8"))
+    assert len(read(tmp_path).frames) == 6
+
+
+def test_numbers_have_no_underscores(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    assert "pano_00.png" in (tmp_path / "sparse" / "0" / "images.txt").read_text(), "names may"
+    _rewrite(tmp_path, "cameras.txt", lambda text: "1 EQUIRECTANGULAR 6_4 32\n")
+    with pytest.raises(DataError, match=r"cameras.txt, line 1: '1 EQUIRECTANGULAR 6_4 32' is not ID MODEL WIDTH"):
+        read(tmp_path)
+
+
+def test_two_cameras_of_one_id_are_refused(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    once = "1 EQUIRECTANGULAR 64 32\n"
+    _rewrite(tmp_path, "cameras.txt", lambda text: 2 * once)
+    assert read(tmp_path).frames[0].width == 64, "the same twice says nothing else"
+    _rewrite(tmp_path, "cameras.txt", lambda text: f"{once}1 EQUIRECTANGULAR 128 64\n")
+    with pytest.raises(DataError, match=r"cameras.txt has 1 twice, with different values; remove one, or export it"):
+        read(tmp_path)
+
+
 def test_binary_sphere_cameras(world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
     file = tmp_path / "sparse/0/cameras.bin"

@@ -73,6 +73,33 @@ def test_values_of_other_types_raise_data_errors(name: str, small: World, tmp_pa
     assert refused > 10
 
 
+@pytest.mark.parametrize("name", FILES)
+def test_a_field_that_is_there_twice_is_refused(name: str, small: World, tmp_path: Path) -> None:
+    WRITERS[name](small, tmp_path / "scene")
+    file = tmp_path / "scene" / FILES[name]
+    text, document = file.read_text(), json.loads(file.read_text())
+    document = document if isinstance(document, dict) else document[0]
+    key = next(iter(document))
+    again = f"{json.dumps(key)}: {json.dumps(document[key])}, "
+    file.write_text(text.replace("{", "{" + again, 1))
+    assert len(read(tmp_path / "scene", name).frames) == 6, "the same twice says nothing else"
+    file.write_text(text.replace("{", f'{{"{key}": "another", ', 1))
+    with pytest.raises(DataError, match=f"{file.name} has '{key}' twice, with different values; remove one"):
+        read(tmp_path / "scene", name)
+
+
+@pytest.mark.parametrize(("name", "file"), [("openmvg", "sfm_data.json"), ("released", "data_extrinsics.json")])
+def test_two_poses_of_one_key_are_refused(name: str, file: str, small: World, tmp_path: Path) -> None:
+    WRITERS[name](small, tmp_path / "scene")
+    path = tmp_path / "scene" / file
+    document = json.loads(path.read_text())
+    first, second, *_ = document["extrinsics"]
+    document["extrinsics"].append({"key": first["key"], "value": second["value"]})
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=rf"extrinsics of .*{file} has {first['key']} twice, with different values"):
+        read(tmp_path / "scene", name)
+
+
 POSE = ("frames", 3, "transform_matrix")
 LIST = ("test_filenames", 1)
 WRONG: list[tuple[str, tuple[Any, ...], Any, str]] = [

@@ -135,6 +135,7 @@ def test_without_transforms_the_frame_is_that_of_the_chunk(folder: Path) -> None
             "<sensor id='1' label='S1'> has the type 'cyl",
         ),
         ('<sensor id="1"', '<sensor id="7"', "cameras use <sensor id='1'>, which is not in <sensors>"),
+        ('<sensor id="1"', '<sensor id="0"', "<sensors> of .*cameras.xml has '0' twice, with different values"),
         (
             r'<resolution width="64"',
             '<resolution width="wide"',

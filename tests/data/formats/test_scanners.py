@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import os
+import re
 import struct
 import sys
 from pathlib import Path
@@ -29,6 +30,17 @@ def test_turned_images_of_navvis_are_recognised_by_colours(turn: float, along: s
     for view in scene.train:
         rotation = torch.from_numpy(world.rotations[world.names.index(view.name)])
         torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+
+
+def test_quoted_names_of_navvis_and_decimal_commas(world: World, tmp_path: Path) -> None:
+    write_navvis(world, tmp_path)
+    file = tmp_path / "pano" / "pano-poses.csv"
+    before, text = load(tmp_path), file.read_text()
+    file.write_text(re.sub(r"(pano_\d+\.png)", r'"\1"', text))
+    assert load(tmp_path).fingerprint == before.fingerprint
+    file.write_text(re.sub(r"(\d)\.(\d+)$", r"\1,\2", text, flags=re.MULTILINE))
+    with pytest.raises(DataError, match=r"pano-poses.csv, line 2: .*; export the poses again, with decimal points"):
+        load(tmp_path)
 
 
 def test_every_path_to_a_scan_of_navvis_finds_its_points(world: World, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Compute the footprint error of each projection by size and latitude.
 
-    python docs/footprint_error.py
+    PYTHONPATH=. python tests/support/footprint_error.py
 
 writes the table in docs/notes/projection_error.md in about two minutes. Tests compare the table with the numbers
 computed here.
@@ -29,7 +29,7 @@ SIGMAS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # degrees
 LATITUDES = (0.0, 30.0, 45.0, 60.0, 70.0, 80.0, 85.0, 89.0)  # degrees
 PIXELS_PER_SIGMA = 4  # a sum over pixels then equals the integral to more digits than are shown
 
-FOLDER = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parents[2] / "docs"
 PROJECTIONS = ("erp", "tangent", "cubemap")
 # The same quantity computed by another program, in percent.
 REFERENCE = {
