@@ -142,6 +142,16 @@ class Setting:
         return [f"{key.rpartition('.')[2]} {self.changed[key]}" for key in keys]
 
 
+def names_of(values: Iterable[str] | None) -> tuple[str, ...]:
+    """Return the names in texts that are lists; a text with ", " is also one name, as scenes may have.
+
+    >>> names_of(["odgs,padgs*", "Flat, old"])
+    ('odgs', 'padgs*', 'Flat', 'old', 'Flat, old')
+    """
+    parts = (part.strip() for value in values or () for part in (*value.split(","), value if ", " in value else ""))
+    return tuple(dict.fromkeys(filter(None, parts)))
+
+
 def _is_value(stored: Any, text: str) -> bool:
     """Return whether a text means a stored value.
 
@@ -167,7 +177,7 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
         runs = runs.loc[[any(map(request.matches, of)) for of in runs["experiments"]]]
     where = dict(request.where)
-    stated = {name: tuple(filter(None, where.pop(name, "").split(","))) for name in ("method", "scene")}
+    stated = {name: names_of([where.pop(name, "")]) for name in ("method", "scene")}
     chosen = [("preset", "method", request.methods), ("scene", "dataset", request.scenes)]
     chosen += [("preset", "method", stated["method"]), ("scene", "dataset", stated["scene"])]
     for *columns, patterns in chosen if len(every) else ():

@@ -38,10 +38,10 @@ def report(
         raise ReportError(f"there is no folder {source}; give the folder of the runs after the name of the report")
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from padgs.reports.frame import frame
-    from padgs.reports.selection import Request, RunSet
+    from padgs.reports.selection import Request, RunSet, names_of
     from padgs.reports.writers import files, write_files  # imports pandas, so not at the top
 
-    names = {"metrics": _listed(metric), "methods": _listed(method), "scenes": _listed(scene)}
+    names = {"metrics": names_of(metric), "methods": names_of(method), "scenes": names_of(scene)}
     request = Request(protocol, mix, strict, experiment=experiment, where=_pairs(where), **names)
     found, broken = store.read(source)
     if collect:
@@ -83,12 +83,6 @@ def report(
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):
         raise typer.Exit(1)
-
-
-def _listed(values: list[str] | None) -> tuple[str, ...]:
-    # Names of scenes may have commas, before a space mostly.
-    parts = (part.strip() for value in values or () for part in (*value.split(","), value if ", " in value else ""))
-    return tuple(dict.fromkeys(filter(None, parts)))
 
 
 def _pairs(settings: list[str] | None) -> dict[str, str]:

@@ -52,6 +52,7 @@ def test_settings_of_a_variant_have_different_titles_though_another_variant_has_
 def test_conditions_all_hold():
     """Names by their option and as a setting; null is a value, also of a key that is null in all runs."""
     stated = [("padgs", "flat", None), ("padgs", "room", 64), ("spags", "flat", 64), ("spags", "room", None)]
+    stated.append(("spags", "Hall, old", 32))
     found = []
     for seed, (method, scene, width) in enumerate(stated):
         config = {"data": {"width": width, "points": None}}
@@ -64,10 +65,11 @@ def test_conditions_all_hold():
     assert chosen(where={"method": "padgs"}) == [0, 1] == chosen(methods=("padgs",))
     assert chosen(methods=("padgs", "spags"), where={"method": "padgs", "scene": "flat"}) == [0]
     assert chosen(where={"scene": "flat,room"}) == [0, 1, 2, 3]
+    assert chosen(where={"scene": "Hall, old"}) == [4], "a name with a comma"
     with pytest.raises(ReportError, match="no run has method spags; runs have padgs, spags"):
         chosen(methods=("padgs",), where={"method": "spags"})
     assert chosen(where={"data.width": "null"}) == [0, 3] == chosen(where={"data.width": "None"})
     assert chosen(where={"data.width": "64"}) == [1, 2]
-    assert chosen(where={"data.points": "null"}) == [0, 1, 2, 3]
+    assert chosen(where={"data.points": "null"}) == [0, 1, 2, 3, 4]
     with pytest.raises(ReportError, match="no run has data.points=5; runs have null"):
         chosen(where={"data.points": "5"})
