@@ -110,7 +110,7 @@ class FrameCheck:
         if self.fits:
             return f"{text}; the file is in the world of the scene"
         if self.rays:
-            return f"{text}; {self.suggested_psnr:.1f} dB with --rays {self.rays}, as it was trained: add that"
+            return f"{text}; {self.suggested_psnr:.1f} dB with --rays {self.rays}: add that"
         text += "; the file is not in the world of the scene, or shows something else"
         if self.suggestion is None:
             return f"{text}. No change of axes, scale and place was found that fits"
@@ -150,10 +150,11 @@ def check_frame(
     found = FrameCheck(quality(Similarity()), flat)
     if found.psnr >= flat + MARGIN or not len(means):
         return found
-    for rays, draw in others.items():
-        if (mark := quality(Similarity(), draw=draw)) > max(found.psnr, flat) + LEAST:
-            return FrameCheck(found.psnr, flat, rays=rays, suggested_psnr=mark)
     best = found
+    for rays, draw in others.items():
+        mark = quality(Similarity(), draw=draw)
+        if mark > max(best.suggested_psnr, found.psnr + LEAST, flat + LEAST):
+            best = FrameCheck(found.psnr, flat, rays=rays, suggested_psnr=mark)
     for words, similarity in _worlds(scene, means, nerfstudio):
         mark = quality(similarity, SEARCHED)
         if mark > max(best.suggested_psnr, found.psnr + LEAST, flat + LEAST):

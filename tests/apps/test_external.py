@@ -141,7 +141,7 @@ def test_rays_that_suit_a_file_are_named(run, splats):
     exact, scene = ExternalMethod.of(thin, RAYS["exact"]), opened.scene
     found = check_frame(scene, exact.render, thin.means.detach(), others={"ewa": opened.method.render})
     assert found.rays == "ewa" and not found.fits
-    assert "dB with --rays ewa, as it was trained: add that" in str(found) and "not in the world" not in str(found)
+    assert "dB with --rays ewa: add that" in str(found) and "not in the world" not in str(found)
     found = check_frame(scene, exact.render, thin.means.detach()[:0], others={"ewa": exact.render})
     assert not found.rays and "not in the world of the scene" in str(found)
 
