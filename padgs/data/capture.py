@@ -51,7 +51,7 @@ def by_id(pairs: Iterable[tuple[Any, Any]], where: str) -> dict[Any, Any]:
     """
     found: dict[Any, Any] = {}
     for key, value in pairs:
-        if str(found.setdefault(key, value)) != str(value):
+        if found.setdefault(key, value) != value:
             raise DataError(f"{where} has {key!r} twice, with different values; remove one, or export it again")
     return found
 

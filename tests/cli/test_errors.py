@@ -61,7 +61,7 @@ def test_whole_numbers_out_of_range_are_refused(option, tmp_path, monkeypatch):
     ],
 )
 def test_empty_texts_are_refused(line, name, tmp_path, monkeypatch):
-    """As of a variable of the shell that is not set."""
+    """A variable of the shell that is not set gives one."""
     monkeypatch.chdir(tmp_path)
     done = run(*(word.replace("@", "") for word in line.split()))
     assert done.exit_code == 1 and f"error: {name} is empty (is a variable of the shell unset?)" in done.output

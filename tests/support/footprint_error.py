@@ -1,8 +1,8 @@
 """Compute the footprint error of each projection by size and latitude.
 
-    PYTHONPATH=. python tests/support/footprint_error.py
+    python tests/support/footprint_error.py
 
-writes the table in docs/notes/projection_error.md in about two minutes. Tests compare the table with the numbers
+writes the table in docs/notes/projection_error.md in half a minute. Tests compare the table with the numbers
 computed here.
 
 The truth is the ray response, the largest value of the Gaussian along each ray; projection `ray` computes it, the

@@ -132,7 +132,7 @@ def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
 def test_gaussians_that_a_format_cannot_hold_are_counted_or_refused(
     world, moved, said, tmp_path, generator, monkeypatch
 ):
-    """As .spz: 24 bits a coordinate in steps of 1/4096 unit, so that 2048 units from the origin it starts again."""
+    """Positions as in .spz: 24 bits a coordinate, in steps of 1/4096 unit, so that they start again at 2048 units."""
     splats = random_splats(0, generator)
     splats.load({name: torch.cat([rows] * 40)[:40] for name, rows in splats.rows().items()})
     with torch.no_grad():
