@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.errors import Depth, Format, Images, Mask, Split, show
+from padgs.cli.errors import Depth, Format, Images, Mask, Points, Split, show
 
 if TYPE_CHECKING:
     from padgs.data.check import Report
@@ -21,6 +21,8 @@ def check(
     mask: Mask = "auto",
     depth: Depth = "auto",
     images: Images = "",
+    points: Points = "auto",
+    cameras: Annotated[str, typer.Option(help="all, or panoramas: leave out images of other cameras")] = "all",
     split: Split = "auto",
 ) -> None:
     """Check a data set and list its problems. Exit code 1 if there are any."""
@@ -35,7 +37,9 @@ def check(
         report = look_through(
             Path(path),
             format=format,
-            options=DataOptions(mask=mask, depth=depth, images=images or None, split=split),
+            options=DataOptions(
+                mask=mask, depth=depth, images=images or None, points=points, cameras=cameras, split=split
+            ),
             overlay=None if overlay == "none" else Path(overlay) if overlay else overlay_path(Path(path)),
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )

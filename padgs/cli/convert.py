@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Depth, Images, Mask, Split, check_range, show
+from padgs.cli.errors import Depth, Images, Mask, Points, Split, check_range, show
 from padgs.cli.prepare import CameraHeight, Gps, Metres
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
@@ -17,7 +17,7 @@ def convert(
     to: Annotated[str, typer.Option(help=f"format to write: {FORMATS}")],
     format: Annotated[str, typer.Option(help=f"format of the source: auto, one of these, or {SOURCES}")] = "auto",
     width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
-    points: Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of starting points")] = "auto",
+    points: Points = "auto",
     mask: Mask = "auto",
     depth: Depth = "auto",
     images: Images = "",

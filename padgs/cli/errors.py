@@ -30,6 +30,7 @@ Mask = Annotated[
     str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder; 255 marks pixels that are used")
 ]
 Depth = Annotated[str, typer.Option(help="auto, or none: ignore depth maps")]
+Points = Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of starting points")]
 Images = Annotated[str, typer.Option(help="image folder, if not the usual one")]
 Split = Annotated[str, typer.Option(help="how to choose held-out views: auto, files, every or all (none held out)")]
 MAX_SEED, MAX_THREADS = 2**32 - 1, max(64, 4 * (os.cpu_count() or 1))

@@ -80,7 +80,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     if unposed:
         notes.append(f"{len(unposed)} images have no pose and are not used: {listed(unposed)}")
     rules = {"mode": options.split, "every": options.test_every, "stated": capture.split}
-    split = split_frames(names, capture.folder, unposed=unposed, **rules)
+    photographs = [frame.name for frame in frames[panoramas:]] if left_out else []
+    split = split_frames(names, capture.folder, unposed=unposed, left_out=photographs, **rules)
     if min(split.train) >= panoramas:
         raise DataError("the train split holds no panorama, only photographs; name a panorama, or set data.split=every")
     points, colors, cloud_notes = initial_cloud(capture, options.points)

@@ -166,12 +166,11 @@ def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene |
 
 
 def _check_leaks(scene: Scene, digests: dict[str, str], report: Report) -> None:
-    """Find test views that are identical or close to training views."""
-    trained = {digests[view.name]: view.name for view in scene.train}
-    for view in scene.test:
-        if twin := trained.get(digests[view.name]):
-            both = f"the test view {view.name} is the same image as the training view {twin}"
-            report.problems.append(f"{both}; remove one of them")
+    """Find views that are identical, and test views that are close to training views."""
+    seen: dict[str, str] = {}
+    for view in (*scene.train, *scene.test):
+        if (twin := seen.setdefault(digests[view.name], view.name)) != view.name:
+            report.problems.append(f"{view.name} is the same image as {twin}; remove one of them")
     if not scene.test:
         return
     train, test = (centers(torch.stack([view.cam_from_world for view in views])) for views in (scene.train, scene.test))

@@ -21,6 +21,7 @@ CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, afte
 PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
 SH_CHANNELS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of files of Gaussians: colour = 1/2 + DC f_dc
 NO_FILE = ("auto", "random")  # values of `data.points` that name no file
+MOST_POINTS = 1_000_000  # more are thinned out evenly, because training starts from each of them
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
 VISIBLE_STEP = 0.002  # of the median distance of points from their middle
@@ -164,6 +165,9 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
         rule = f"not finite, or farther than {FARTHEST:g} from the origin"
         raise DataError(f"{bad} of {len(points)} points of {where} are {rule}; remove them from the cloud")
     notes = (*notes, *_rounded(points, where))
+    if (step := -(-len(points) // MOST_POINTS)) > 1:
+        points, colors = points[::step], None if colors is None else colors[::step]
+        notes = (*notes, f"points: one in {step} of {where}, {len(points)} in all")
     if colors is None or not colors.any():  # black is what scanners without a camera write
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
         notes = (*notes, GREY_POINTS)

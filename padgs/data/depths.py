@@ -158,7 +158,7 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
     usual = (first_of(base, (name,), Path.is_dir) for base in places for name in FOLDERS)
     for folder in dict.fromkeys(folder for folder in usual if folder):
         inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
-        maps = [path for path in inside if path.suffix.lower() in EXTENSIONS]
+        maps = [path for end in reversed(EXTENSIONS) for path in inside if path.suffix.lower() == end]  # the best last
         there = {_folded(path.relative_to(folder).with_suffix("")): path for path in maps}
         files = {}
         for frame in capture.frames:

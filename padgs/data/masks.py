@@ -119,7 +119,7 @@ def find_masks(
             rule = "a mask must have the size of its image, or be no smaller than the view"
             raise DataError(f"{path} is {sizes_differ}; {rule} ({width}x{height}, data.width): enlarge it")
         stored = StoredImage(path, width, height, store, "L", image.crop)
-        mask = Mask(stored, fixed, inverted ^ path.name.startswith(INVERTED))
+        mask = Mask(stored, fixed, inverted or path.name.startswith(INVERTED))
         if mask.file not in shown:
             rule = f" of {frame.name}; {_MEANING}"
             shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule) / pictured
@@ -181,7 +181,9 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
     if given.is_file():
         panoramas = [frame.name for frame in capture.frames if frame.lens is None]
         which = "every view" if len(panoramas) == len(capture.frames) else "every panorama"
-        return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}"
+        beside = first_of(given.parent, MASK_FOLDERS, Path.is_dir) if given.parent == capture.folder else None
+        unused = f"; {beside.name}/ is not used (data.mask={beside.name} uses it)" if beside else ""
+        return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}{unused}"
     beside, listings = given == capture.image_folder, {}
     found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside, listings))}
     if beside and not found:

@@ -12,9 +12,8 @@ import torch
 
 from padgs.checks import install_command
 from padgs.data.capture import Cloud, DataError, refuse_special
-from padgs.data.cloud import color_bytes, joined
+from padgs.data.cloud import MOST_POINTS, color_bytes, joined
 
-MOST_POINTS = 1_000_000  # of a scan; more are thinned out evenly, because training starts from each of them
 CHUNK = 1_000_000  # points in memory at a time
 CHANNELS = ("red", "green", "blue")
 
@@ -150,4 +149,4 @@ def _scan(file: Any, header: Any, step: int) -> Cloud:
 
 
 def _thinned(path: Path, cloud: Cloud, step: int) -> tuple[Cloud, tuple[str, ...]]:
-    return cloud, (f"points: every {step}th of {path.name}, {len(cloud.points)} in all",) if step > 1 else ()
+    return cloud, (f"points: one in {step} of {path.name}, {len(cloud.points)} in all",) if step > 1 else ()

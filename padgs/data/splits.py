@@ -31,13 +31,14 @@ def split_frames(
     every: int = 8,
     stated: Mapping[str, tuple[str, ...]] | None = None,
     unposed: Sequence[str] = (),
+    left_out: Sequence[str] = (),
 ) -> Split:
     """Decide for each frame whether it is a training view, a test view, or unused.
 
     `names` are those of frames, with extension and sorted; `folder` holds `train.txt` and `test.txt`, if any: one name
     a line, with or without extension. `mode` is files; every (views 0, k, 2k, ... are test views, k is `every`); all
-    (no test views); or auto: the lists that the format has `stated`, else files if there is a list, else every. A
-    DataError says that a list holds unknown, ambiguous or `unposed` names, that lists overlap, or that a side is empty.
+    (no test views); or auto: the lists that the format has `stated`, else files if there is a list, else every. Lists
+    may hold names that are `left_out`. A DataError says that a list holds unknown, ambiguous or `unposed` names, that lists overlap, or that a side is empty.
     """
     if mode == "all":
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
@@ -48,14 +49,16 @@ def split_frames(
     origin = "the split of the data set"
     if lists and files:
         origin += f"; {' and '.join(file.name for file in files.values())} not used: data.split=files uses them"
+    which = {side: f"{side} list of the data set" for side in lists}
     if not lists and mode != "every":
         lists = {side: read_list(file) for side, file in files.items()}
+        which = {side: f"{side} list {file}" for side, file in files.items()}
         origin = " and ".join(file.name for file in files.values())
     if not lists:
         if mode == "files":
             raise DataError(f"data.split=files, but {folder} holds no train.txt, no test.txt; write them or use every")
         return _every(names, every, mode)
-    chosen = {side: _resolve(lines, names, f"{side} list", unposed) for side, lines in lists.items()}
+    chosen = {side: _resolve(lines, names, which[side], unposed, left_out) for side, lines in lists.items()}
     notes = [f"split: {origin}"]
     for side, other in (("train", "test"), ("test", "train")):
         if side not in chosen:
@@ -66,7 +69,9 @@ def split_frames(
         raise DataError(f"train and test list overlap: {overlap}; a view is one or the other")
     for side in ("train", "test"):
         if not chosen[side]:
-            raise DataError(f"the {side} split is empty; name at least one view, or set data.split=every")
+            raise DataError(
+                f"the {side} split is empty; name at least one view, or set data.split to every, or to all for no test views"
+            )
     if unused := len(names) - len(chosen["train"]) - len(chosen["test"]):
         notes.append(f"{unused} posed views are in neither list and are not used")
     return Split(tuple(sorted(chosen["train"])), tuple(sorted(chosen["test"])), tuple(notes))
@@ -130,7 +135,9 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
     return Split(train, test, (f"split: every {every}th view is a test view ({why})",))
 
 
-def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str]) -> set[int]:
+def _resolve(
+    lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str], left_out: Sequence[str]
+) -> set[int]:
     meant: dict[str, set[int]] = {}
     for i, name in enumerate(names):
         for key in spellings(name):
@@ -146,10 +153,11 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
         if not found:
             absent.append(line)
         chosen |= found
-    there = {key for name in unposed for key in spellings(name)}
+    there, ignored = ({key for name in some for key in spellings(name)} for some in (unposed, left_out))
+    absent = [line for line in absent if not ignored & set(spellings(line))]
     if without := [line for line in absent if there & set(spellings(line))]:
         raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
     if absent:
-        known = f"the data set has {listed(names)}"
-        raise DataError(f"the {which} names images that do not exist: {listed(absent)}; {known}")
+        rule = f"a line is one name, and the data set has {listed(names)}"
+        raise DataError(f"the {which} names images that do not exist: {listed(map(repr, absent))}; {rule}")
     return chosen

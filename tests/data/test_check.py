@@ -79,7 +79,11 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "lists overlap": (lambda f: shutil.copy(f / "train.txt", f / "test.txt"), "train and test list overlap: pano_00"),
     "same image twice": (
         lambda f: shutil.copy(f / "images/pano_00.png", f / "images/pano_01.png"),
-        "the test view pano_01 is the same image as the training view pano_00",
+        "pano_01 is the same image as pano_00; remove one of them",
+    ),
+    "one picture with two training poses": (
+        lambda f: shutil.copy(f / "images/pano_00.png", f / "images/pano_02.png"),
+        "pano_02 is the same image as pano_00; remove one of them",
     ),
     "empty cloud": (lambda f: (f / "sparse/0/points3D.txt").write_text("\n"), "holds no points; training starts"),
     "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "images.bin ends early"),
@@ -149,6 +153,8 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     assert run(app, ["check", str(folder)]).exit_code == 0
     assert (folder / "check.png").is_file() and not (tmp_path / "check.png").exists()
+    chosen = run(app, ["check", str(folder), "--points", "random", "--overlay", "none"])
+    assert "100000 random points around the cameras (data.points=random)" in chosen.output
     (folder / "images/pano_02.png").unlink()
     bad = run(app, ["check", str(folder), "--overlay", "none"])
     assert (
@@ -156,6 +162,7 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     assert run(app, ["check", str(tmp_path / "absent"), "--overlay", "none"]).exit_code == 1
     assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).stderr
+    assert "unknown data.cameras 'x'" in run(app, ["check", str(folder), "--cameras", "x"]).stderr
 
 
 def test_the_convert_command(world: World, tmp_path: Path) -> None:

@@ -217,6 +217,16 @@ def test_depth_maps_in_tiff_files_and_folders_that_are_not_used(world: World, tm
     torch.testing.assert_close(view.load_depth(), 2 * truth(world, 0).float())
 
 
+def test_of_two_maps_of_a_view_numbers_count_and_not_a_picture(world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    (tmp_path / "depths").mkdir()
+    (tmp_path / "depths" / "depth.json").write_text('{"measure": "ray", "unit": 1}')
+    np.save(tmp_path / "depths" / f"{world.names[0]}.npy", truth(world, 0).numpy())
+    Image.fromarray(np.full((32, 64), 200, np.uint8)).save(tmp_path / "depths" / f"{world.names[0]}.png")
+    view = next(view for view in load(tmp_path).train if view.name == world.names[0])
+    torch.testing.assert_close(view.load_depth(), truth(world, 0).float())
+
+
 def test_depths_are_checked_against_the_points_and_converted(world: World, tmp_path: Path):
     write_colmap_text(world, tmp_path / "a")
     (tmp_path / "a" / "depths").mkdir()

@@ -94,6 +94,28 @@ def test_inverted_masks_are_asked_about_and_inverted(folder: Path) -> None:
         load(folder, mask="inverted:none")
 
 
+@pytest.mark.parametrize("file", ["masks/pano_00.png", "images/dynamic_mask_pano_00.png"])
+def test_inverted_means_that_white_is_ignored_whatever_the_name(file: str, folder: Path) -> None:
+    _mask(folder / file, hidden_rows=12)
+    assert load(folder, mask="inverted").train[0].mask().mean() == 12 / 32
+
+
+def test_masks_that_transforms_json_names_are_inverted_too(world: World, tmp_path: Path) -> None:
+    write_transforms(world, tmp_path)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(data["frames"]):
+        frame["mask_path"] = f"ignore/m{i}.png"
+        _mask(tmp_path / frame["mask_path"], hidden_rows=12)
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    assert [load(tmp_path, mask=spec).train[0].mask().mean() for spec in ("auto", "inverted")] == [20 / 32, 12 / 32]
+
+
+def test_a_mask_for_the_scene_says_that_others_are_not_used(folder: Path) -> None:
+    _mask(folder / "mask.png")
+    _mask(folder / "masks" / "pano_00.png")
+    assert "mask: mask.png for every view; masks/ is not used (data.mask=masks uses it)" in load(folder).notes
+
+
 def test_masks_of_zeros_and_ones(folder: Path) -> None:
     Image.fromarray((np.arange(32 * 64).reshape(32, 64) < 1024).astype(np.uint8)).save(folder / "mask.png")
     assert load(folder).train[0].mask().mean() == 0.5

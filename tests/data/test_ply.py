@@ -7,7 +7,7 @@ import torch
 from support.fixtures import World, write_cloud
 
 from padgs.data.capture import Capture, Cloud, DataError
-from padgs.data.cloud import GREY_POINTS, initial_cloud, read_ply, write_ply
+from padgs.data.cloud import GREY_POINTS, MOST_POINTS, initial_cloud, read_ply, write_ply
 from padgs.data.formats.json_file import read_json
 
 
@@ -189,3 +189,11 @@ def test_points_beyond_what_can_be_rendered_are_refused(tmp_path: Path) -> None:
         cloud = Cloud(torch.tensor([[0.0, 0, 1], [0, far, 0]], dtype=torch.float64), None)
         with pytest.raises(DataError, match=r"1 of 2 points .* are not finite, or farther than 1e\+15 from the origin"):
             initial_cloud(Capture("transforms", tmp_path, tmp_path, (), cloud), "auto")
+
+
+def test_a_cloud_of_any_format_is_thinned_to_a_million_points(tmp_path: Path) -> None:
+    points = torch.arange(3 * (2 * MOST_POINTS + 1), dtype=torch.float64).view(-1, 3)
+    cloud = Cloud(points, (points % 200 + 1).to(torch.uint8))
+    kept, colors, notes = initial_cloud(Capture("made", tmp_path, tmp_path, (), cloud), "auto")
+    assert torch.equal(kept, points[::3]) and torch.equal(colors, cloud.colors[::3])
+    assert any(note.startswith("points: one in 3 of the made model") for note in notes)

@@ -66,11 +66,12 @@ def test_unused_views_are_reported(tmp_path: Path) -> None:
     ("train", "test", "message"),
     [
         ("a\nb", "b\nc", "train and test list overlap: b.jpg; a view is one or the other"),
-        ("a\nx\ny", "b", r"the train list names images that do not exist: x, y; the data set has a.jpg, b.jpg"),
-        ("a\nlost", "b", "the train list names images that have no pose: lost; remove them"),
-        ("a", "\n\n", "the test split is empty; name at least one view, or set data.split=every"),
+        ("a\nx\ny", "b", r"train list \S*train.txt names images that do not exist: 'x', 'y'; a line is one name, and"),
+        ("a.jpg, b.jpg", "b", "do not exist: 'a.jpg, b.jpg'; a line is one name"),
+        ("a\nlost", "b", r"the train list \S*train.txt names images that have no pose: lost; remove them"),
+        ("a", "\n\n", "the test split is empty; name at least one view, or set data.split to every, or to all"),
         ("", "a", "the train split is empty"),
-        ("../../etc/passwd", "a", "the train list names images that do not exist: ../../etc/passwd"),
+        ("../../etc/passwd", "a", "names images that do not exist: '../../etc/passwd'"),
     ],
 )
 def test_unusable_lists(train: str, test: str, message: str, tmp_path: Path) -> None:

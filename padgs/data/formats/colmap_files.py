@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from padgs.data.capture import Cloud, DataError
+from padgs.data.capture import Cloud, DataError, by_id
 from padgs.data.cloud import color_bytes, whole_if_possible
 from padgs.data.images import read_bytes
 from padgs.data.splits import read_lines
@@ -136,7 +136,7 @@ def read_points(file: Path) -> Points:
             return values
 
         rows = _entries(file, entry)
-    rows.sort(key=lambda row: row[0])
+    rows = [row for _, row in sorted(by_id(((row[0], row) for row in rows), str(file)).items())]
     values = np.array([row[1:] for row in rows], np.float64).reshape(-1, 6)
     colors = color_bytes(whole_if_possible(values[:, 3:]), str(file))
     cloud = Cloud(torch.from_numpy(values[:, :3].copy()), colors)

@@ -17,7 +17,7 @@ from torch import Tensor
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, UnknownLens, by_id, files_with, listed
 from padgs.data.cloud import read_ply
-from padgs.data.formats.poses import cam_from_pose, checked_rotation, rigid
+from padgs.data.formats.poses import cam_from_pose, rigid
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_name
 
@@ -168,16 +168,19 @@ def _similarity(element: XML.Element, where: str) -> Tensor:
     """Read a similarity [4, 4]: rotation, translation and scale, or 16 numbers."""
     if element.find("rotation") is None:
         matrix = _numbers(element, 16, where).reshape(4, 4)
-        scale = torch.linalg.det(matrix[:3, :3]).clamp(min=0) ** (1 / 3)
-        rotation, translation = matrix[:3, :3] / scale, matrix[:3, 3]
+        scale = torch.linalg.det(matrix[:3, :3]).abs() ** (1 / 3)
     else:
         rotation = _numbers(element.find("rotation"), 9, f"<rotation> of {where}").reshape(3, 3)
         translation = _numbers(element.find("translation"), 3, f"<translation> of {where}")
         stated = element.find("scale")
         scale = torch.ones(()) if stated is None else _numbers(stated, 1, f"<scale> of {where}")[0]
+        matrix = rigid(scale * rotation, translation)
     if not scale > 0:
         raise DataError(f"{where}: the scale is {scale.item():g}; it must be positive")
-    return rigid(scale * checked_rotation(rotation, where), translation)
+    matrix[:3, :3] /= scale
+    unscaled = torch.linalg.inv(cam_from_pose(matrix, where))
+    unscaled[:3, :3] *= scale
+    return unscaled
 
 
 def _numbers(element: XML.Element | None, count: int, where: str) -> Tensor:

@@ -97,7 +97,7 @@ def _mvg_views(data: Json) -> list[MvgView]:
         size = view["width"].whole(), view["height"].whole()
         camera = view.get("id_intrinsic")
         views.append(MvgView(key.whole(), (view.get("id_pose") or key).whole(), name, size, camera and camera.whole()))
-    return views
+    return list(by_id(((view.key, view) for view in views), f"views of {data.where}").values())
 
 
 def _mvg_poses(data: Json) -> dict[int, Tensor]:
@@ -138,14 +138,16 @@ def read_opensfm(path: Path, options: DataOptions) -> Capture:
 
 
 def _opensfm_cloud(part: Json) -> Cloud | None:
+    """Return the points, without those that lack a colour if others have one."""
     stated = part.get("points")
     points = list(stated.items().values()) if stated else []
     if not points:
         return None
+    points = [point for point in points if point.get("color")] or points
     where, colors = f"the points of {part.where}", None
     positions = Json([point["coordinates"].value for point in points], where)
     paint = [color.value for point in points if (color := point.get("color"))]
-    if len(paint) == len(points):
+    if paint:
         values = Json(paint, f"color of {where}").numbers(len(points), 3)
         colors = color_bytes(whole_if_possible(values.numpy()), where)
     return Cloud(positions.numbers(len(points), 3), colors)

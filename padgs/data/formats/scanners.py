@@ -67,6 +67,9 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
     files = [path] if path.is_file() else files_with(path, ".e57")
     if not files:
         raise DataError(f"{path} holds no .e57 file")
+    if options.images is not None:
+        rule = "an E57 file holds its images: edit those written beside it"
+        raise DataError(f"data.images={options.images}: {rule}, or convert it and name another folder then")
     root, named = path.parent if path.is_file() else path, listed(file.name for file in files)
     frames: list[Frame] = []
     others: list[str] = []

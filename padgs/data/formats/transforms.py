@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 
-from padgs.data.assemble import IMAGE_FOLDERS
+from padgs.data.assemble import IMAGE_FOLDERS, image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed
 from padgs.data.cloud import first_ply, read_ply
 from padgs.data.depths import HOW
@@ -33,11 +33,11 @@ def read(path: Path, options: DataOptions) -> Capture:
     metas = {"": read_json(file)} if file.exists() else {side: read_json(part) for side, part in sides.items()}
     if not metas:
         raise DataError(f"{folder} holds neither {FILE} nor {SIDES['train'][0]} and {SIDES['test'][0]}")
-    root = folder if options.images is None else folder / options.images
+    root = folder if options.images is None else image_folder(folder, options.images)
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side, meta in metas.items():
-        entries, reads_masks = meta["frames"].entries(), options.mask == "auto"
+        entries, reads_masks = meta["frames"].entries(), options.mask in ("auto", "inverted")
         part = [_frame(meta, frame, folder, root, reads_masks=reads_masks) for frame in entries]
         frames += part
         if len(metas) > 1:

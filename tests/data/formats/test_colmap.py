@@ -12,6 +12,8 @@ from support.fixtures import World, write_cloud, write_colmap_binary, write_colm
 from padgs.data import DataError, load, read
 from padgs.data.conventions import reprojection_errors
 
+POINTS = "1 0 0 5 1 2 3 0.1 1 0\n1 0 0 6 1 2 3 0.1 1 0\n"
+
 
 def test_tracks_reproject(world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
@@ -151,6 +153,17 @@ def test_two_cameras_of_one_id_are_refused(world: World, tmp_path: Path) -> None
     assert read(tmp_path).frames[0].width == 64, "the same twice says nothing else"
     _rewrite(tmp_path, "cameras.txt", lambda text: f"{once}1 EQUIRECTANGULAR 128 64\n")
     with pytest.raises(DataError, match=r"cameras.txt has 1 twice, with different values; remove one, or export it"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "entry"),
+    [("images.txt", "1 1 0 0 0 5 5 5 1 pano_00.png\n\n1 1 0 0 0 6 6 6 1 pano_01.png\n\n"), ("points3D.txt", POINTS)],
+)
+def test_two_entries_of_one_id_are_refused(file: str, entry: str, world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    _rewrite(tmp_path, file, lambda text: entry)
+    with pytest.raises(DataError, match=rf"{file} has 1 twice, with different values"):
         read(tmp_path)
 
 

@@ -277,6 +277,32 @@ def test_photographs_beside_panoramas_are_left_out_on_request(format: str, file:
     assert any("1 of 6 images are no panoramas; they are left out" in note for note in scene.notes)
 
 
+def test_lists_may_name_photographs_that_are_left_out(world: World, tmp_path: Path) -> None:
+    WRITERS["opensfm"](world, tmp_path)
+    data = json.loads((tmp_path / "reconstruction.json").read_text())
+    _other_camera(data, "opensfm")
+    (tmp_path / "reconstruction.json").write_text(json.dumps(data))
+    (tmp_path / "train.txt").write_text("pano_00\npano_01\npano_02\n")
+    (tmp_path / "test.txt").write_text("pano_03\n")
+    scene = load(tmp_path, cameras="panoramas")
+    assert [view.name for view in scene.train] == ["pano_01", "pano_02"]
+
+
+def test_points_of_opensfm_without_colours_do_not_hide_those_with_colours(world: World, tmp_path: Path) -> None:
+    WRITERS["opensfm"](world, tmp_path)
+    data = json.loads((tmp_path / "reconstruction.json").read_text())
+    del data[1]["points"]["0"]["color"]
+    (tmp_path / "reconstruction.json").write_text(json.dumps(data))
+    assert torch.equal(load(tmp_path).point_colors, torch.from_numpy(world.colors[1:]))
+
+
+def test_a_missing_image_folder_is_named_in_every_format(world: World, tmp_path: Path) -> None:
+    for name, write in WRITERS.items():
+        write(world, tmp_path / name)
+        with pytest.raises(DataError, match="data.images=nope: there is no folder"):
+            load(tmp_path / name, images="nope")
+
+
 def test_absolute_masks_do_not_matter_if_masks_are_not_used(world: World, tmp_path: Path) -> None:
     def masked(meta: dict[str, Any]) -> None:
         meta |= {"frames": [{**frame, "mask_path": "/data/masks/x.png"} for frame in meta["frames"]]}

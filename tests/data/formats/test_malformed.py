@@ -100,6 +100,17 @@ def test_two_poses_of_one_key_are_refused(name: str, file: str, small: World, tm
         read(tmp_path / "scene", name)
 
 
+@pytest.mark.parametrize(("name", "file"), [("openmvg", "sfm_data.json"), ("released", "data_views.json")])
+def test_two_views_of_one_key_are_refused(name: str, file: str, small: World, tmp_path: Path) -> None:
+    WRITERS[name](small, tmp_path / "scene")
+    path = tmp_path / "scene" / file
+    document = json.loads(path.read_text())
+    document["views"][1]["key"] = document["views"][0]["key"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=rf"views of .*{file} has {document['views'][0]['key']} twice"):
+        read(tmp_path / "scene", name)
+
+
 POSE = ("frames", 3, "transform_matrix")
 LIST = ("test_filenames", 1)
 WRONG: list[tuple[str, tuple[Any, ...], Any, str]] = [
@@ -122,7 +133,7 @@ WRONG: list[tuple[str, tuple[Any, ...], Any, str]] = [
     ("transforms", ("frames", 0, "file_path"), "\udce9.png", "which is not Unicode; rename the file"),
     ("transforms", ("ply_file_path",), "/etc/passwd", "names '/etc/passwd'; names must be relative"),
     ("transforms", ("ply_file_path",), "absent.ply", "the point cloud .*absent.ply does not exist"),
-    ("transforms", LIST, "images/x.png", "the test list names images .*: x.png"),
+    ("transforms", LIST, "images/x.png", "the test list of the data set names images .*: 'x.png'"),
     ("transforms", LIST, "images/pano_00.png", "overlap: pano_00.png"),
     ("transforms", ("h",), 33, "the camera of pano_00.png is 16x33; a full panorama is 2:1"),
     ("transforms", ("w",), 0, "the camera of pano_00.png is 0x8; a full panorama is 2:1"),

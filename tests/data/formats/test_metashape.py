@@ -20,6 +20,9 @@ def folder(world: World, tmp_path: Path) -> Path:
     return tmp_path
 
 
+LAST = r"<transform>(?:(?!<transform>).)*</transform></chunk>"
+
+
 def _edit(folder: Path, *changes: tuple[str, str]) -> None:
     text = (folder / "cameras.xml").read_text()
     for pattern, new in changes:
@@ -143,6 +146,12 @@ def test_without_transforms_the_frame_is_that_of_the_chunk(folder: Path) -> None
         ),
         (r"(?s)<component id=.1. label=.Component 1.><transform>.*?</transform>", '<component id="1">', "2 components"),
         (r"<scale>[^<]*", "<scale>0", "<transform> of .* the scale is 0; it must be positive"),
+        (
+            LAST,
+            "<transform>0 2 0 0 -2 0 0 0 0 0 2 0 5 6 7 1</transform></chunk>",
+            "the pose is transposed, its last row",
+        ),
+        (LAST, "<transform>0 2 0 5 -2 0 0 6 0 0 -2 7 0 0 0 1</transform></chunk>", "of the chunk .* left-handed"),
         (r"<rotation>[^<]*", "<rotation>1 0 0 0 1 0 0 0 2", "<transform> of .* is not a rotation"),
         (r"<translation>[^<]*", "<translation>1 2", "<translation> of <transform> of .* must hold 3 finite numbers"),
         (r"(pano_02.*?<transform>)\S+", r"\1nan", "<transform> of camera 'pano_02' in .* must hold 16 finite"),

@@ -159,7 +159,7 @@ def test_las_clouds(end: str, scale: int, coloured: bool, laspy, world: World, t
     monkeypatch.setattr(scans_module, "MOST_POINTS", 150)
     monkeypatch.setattr(scans_module, "CHUNK", 64)
     cloud, notes = read_cloud(tmp_path / f"cloud.{end}")
-    assert notes == (f"points: every 3th of cloud.{end}, 134 in all",)
+    assert notes == (f"points: one in 3 of cloud.{end}, 134 in all",)
     np.testing.assert_allclose(cloud.points, world.points[::3], atol=2e-6)
     whole = (tmp_path / f"cloud.{end}").read_bytes()
     (tmp_path / f"cloud.{end}").write_bytes(whole[:-900])
