@@ -38,7 +38,8 @@ def split_frames(
     `names` are those of frames, with extension and sorted; `folder` holds `train.txt` and `test.txt`, if any: one name
     a line, with or without extension. `mode` is files; every (views 0, k, 2k, ... are test views, k is `every`); all
     (no test views); or auto: the lists that the format has `stated`, else files if there is a list, else every. Lists
-    may hold names that are `left_out`. A DataError says that a list holds unknown, ambiguous or `unposed` names, that lists overlap, or that a side is empty.
+    may hold names that are `left_out`. A DataError says that a list holds unknown, ambiguous or `unposed` names, that
+    lists overlap, or that a side is empty.
     """
     if mode == "all":
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
@@ -69,9 +70,8 @@ def split_frames(
         raise DataError(f"train and test list overlap: {overlap}; a view is one or the other")
     for side in ("train", "test"):
         if not chosen[side]:
-            raise DataError(
-                f"the {side} split is empty; name at least one view, or set data.split to every, or to all for no test views"
-            )
+            ways = "name at least one view, or set data.split to every, or to all for no test views"
+            raise DataError(f"the {side} split is empty; {ways}")
     if unused := len(names) - len(chosen["train"]) - len(chosen["test"]):
         notes.append(f"{unused} posed views are in neither list and are not used")
     return Split(tuple(sorted(chosen["train"])), tuple(sorted(chosen["test"])), tuple(notes))
