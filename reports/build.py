@@ -22,7 +22,7 @@ PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers 
 # No column if no run has a number
 IF_KNOWN = ("cpu_seconds", "peak_gpu_gigabytes", "sphere/abs_rel", "sphere/delta_1_25")
 SEEN_NOTE = (
-    "Tuned on: settings of methods were chosen on the scene; never seen: none was, but for the exceptions that the "
+    "Tuned on: settings of methods were chosen on the scene; not tuned on: none was, but for the exceptions that the "
     "limitations name."
 )
 RATES = {"published": "published rates", "run": "rates for the run"}
@@ -47,6 +47,7 @@ class _Builder:
         measures = self.spec.measures(self.request.protocol)
         if self.request.metrics and not self.spec.pivot:
             own = {measure.name.rpartition("/")[2]: measure for measure in measures}
+            own |= {of.name.rpartition("/")[2]: of for of in measures if of.name.startswith(self.request.protocol)}
             measures = [own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics]
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
@@ -157,8 +158,7 @@ class _Builder:
         """Return preset -> title of those that were run, and of methods with published numbers."""
         where = (self.spec.paper.get(place.dataset), published.DATASETS.get(place.dataset), place.scene)
         known = (key.method for key in self.paper if (key.table, key.dataset, key.scene) == where)
-        run = set(runs["preset"])
-        presets = methods.ordered((*known, *run))
+        presets, run = methods.ordered((*known, *runs["preset"])), {*self.runs["preset"]}
         return {preset: methods.title(preset) if preset in run else methods.name(preset) for preset in presets}
 
     def _rows(
@@ -168,18 +168,18 @@ class _Builder:
         theirs: Mapping[str, Mapping[str, Published]],
         runs: DataFrame,
     ) -> tuple[Row, ...]:
-        first, rows = next(iter(cells.values()), ()), []
+        of, rows = {value: runs.loc[runs[self.spec.rows] == value] for value in cells}, []
         for value, ours in cells.items():
-            comparable = as_published(runs.loc[runs[self.spec.rows] == value])
+            comparable = as_published(of[value])
             row: list[Cell] = []
-            for index, (measure, cell) in enumerate(zip(self.measures, ours, strict=True)):
+            for measure, cell in zip(self.measures, ours, strict=True):
                 row.append(cell)
                 if self.paper and measure.published:
                     row.append(_published(theirs[value].get(measure.published)))
                     if measure.difference:
                         row.append(_difference(cell, row[-1]) if comparable else Cell())
                 if self.spec.difference and _is_psnr(measure):
-                    row.append(_difference(cell, first[index]))
+                    row.append(Cell(_by_seed(of[value], next(iter(of.values())), measure).value))
             rows.append(Row(titles[value], tuple(row)))
         return tuple(rows)
 
@@ -237,7 +237,8 @@ class _Builder:
         """Return a row for each setting, the best first, those without a number last."""
         every = [(one.title, one_setting(one.runs, f"{where}, {one.title}")) for one in settings(runs)]
         found = [(title, over_seeds(own, self.measures)) for title, own in every]
-        found.sort(key=lambda row: (row[1][0].value is None, -(row[1][0].value or 0.0)))
+        sign = -1.0 if self.measures[0].column.higher_is_better else 1.0
+        found.sort(key=lambda row: (row[1][0].value is None, sign * (row[1][0].value or 0.0)))
         cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
         separable = all(cell.count >= SEEDS for cell in cells.values())
         shared = places(cells, self.measures[0].column) if separable else []
@@ -305,9 +306,7 @@ class _Pivot(_Builder):
             return Cell()
         near = min(means, key=lambda factor: abs(math.log(factor / law(key[0], methods.method_of(preset)))))
         best = max(means, key=lambda factor: means[factor])
-        column = self.measures[0].name
-        ours, others = (factors[f][1].query("ok").set_index("seed")[column].astype(float) for f in (near, best))
-        return mean_cell((ours - others).dropna().tolist())
+        return _by_seed(factors[near][1], factors[best][1], self.measures[0])
 
     def _lengths(self, title: str, runs: DataFrame, keys: Mapping[Any, Column]) -> list[Block]:
         cells = self._cells(runs, title, "preset", *self.spec.pivot)
@@ -324,6 +323,12 @@ def _published(number: Published | None) -> Cell:
     if number is None or number.status == "missing":
         return Cell()
     return Cell(number.value, status="" if number.status == "ok" else number.status)
+
+
+def _by_seed(ours: DataFrame, theirs: DataFrame, measure: Measure) -> Cell:
+    """Return the mean difference of the runs of two settings with the same seeds, failed runs left out."""
+    first, second = (of.loc[of["ok"]].set_index("seed")[measure.name].astype(float) for of in (ours, theirs))
+    return mean_cell((first - second).dropna().tolist())
 
 
 def _difference(ours: Cell, theirs: Cell) -> Cell:

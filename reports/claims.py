@@ -14,10 +14,10 @@ from padgs.reports import REPORTS, methods, published
 from padgs.reports.conditions import as_published, refuse_mixture
 from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
-from padgs.reports.published import DATASETS, NEVER_SEEN, TUNED_ON, Key, Place, Published
-from padgs.reports.selection import RunSet, one_setting, settings
+from padgs.reports.published import DATASETS, NOT_TUNED_ON, TUNED_ON, Key, Place, Published
+from padgs.reports.selection import Mixture, RunSet, one_setting, settings
 from padgs.reports.significance import CONFIDENCE, differ, failures, mean_cell, paired_test
-from padgs.reports.table import MISSING
+from padgs.reports.table import MISSING, ReportError
 from padgs.reports.writers import Page, rendered
 from padgs.results import higher_is_better
 
@@ -188,7 +188,7 @@ def findings(run_set: RunSet) -> Page:
         verdicts=verdicts,
         notes=[(no, one.claim) for no, one in numbered if one.claim.note],
         evidence=[(one, in_the_paper(one.claim, numbers)) for one in tested],
-        marks={"": "", TUNED_ON: " †", NEVER_SEEN: " ‡"},
+        marks={"": "", TUNED_ON: " †", NOT_TUNED_ON: " ‡"},
         missing=MISSING,
         least_seeds=LEAST_SEEDS,
         confidence=CONFIDENCE,
@@ -200,8 +200,8 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
     """Return a row for each scene: the advantage of the means over seeds over the best rival's.
 
     Of the sizes and lengths that both sides have, those with `LEAST_SEEDS` of both count first, then the widest, then
-    the longest. Scenes that were never seen decide claims of our own alone, where there are any: nothing of the paper's
-    methods was chosen on a scene.
+    the longest. Scenes that were not tuned on decide claims of our own alone, where there are any: nothing of the
+    paper's methods was chosen on a scene.
     """
     runs = run_set.of_experiments(*claim.experiments)
     if claim.scenes:
@@ -214,7 +214,11 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         size, length = found["resolution"], found["length"]
         where = f"{claim.text}, {found['place'].scene}, {size}, {length}"
         refuse_mixture(alike, run_set.request, where, ("protocol",))
-        if row := _beside_best(claim, one_setting(ours.select(alike), where), others.select(alike)):
+        try:
+            own = one_setting(ours.select(alike), where)
+        except Mixture as mixture:  # to separate our side alone would leave it without rivals
+            raise ReportError(str(mixture)) from mixture
+        if row := _beside_best(claim, own, others.select(alike), where):
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
             row |= {
                 "place": found["place"],
@@ -230,17 +234,18 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             scene = (of.dataset, of.scene.replace(OTHER_PATH, ""), of.seen if of.dataset != published.BUILT_IN else "")
             best[scene] = max(row, best.get(scene, row), key=rank)
     rows = DataFrame(sorted(best.values(), key=lambda row: row["place"].rank))
-    if claim.source == OURS and len(rows) and (never := rows["tested"] & (rows["seen"] == NEVER_SEEN)).any():
-        rows["tested"] = never
+    if claim.source == OURS and len(rows) and (untuned := rows["tested"] & (rows["seen"] == NOT_TUNED_ON)).any():
+        rows["tested"] = untuned
     return rows
 
 
-def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame) -> dict[str, Any] | None:
+def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame, where: str) -> dict[str, Any] | None:
     """Return the advantage over the rival with the best mean, its title, and the seeds of both."""
     first, higher = _numbers(claim, ours), claim.measure.column.higher_is_better
     rivals = {}
     for setting in settings(others.drop(index=ours.index, errors="ignore")) if len(others) else ():
-        if len(theirs := _numbers(claim, setting.runs)):
+        good = one_setting(setting.runs.loc[setting.runs["ok"]], f"{where}, {setting.title}")
+        if len(theirs := _numbers(claim, good)):
             rivals[setting.title] = theirs
     if not rivals or (not len(first) and ours["ok"].all()):
         return None

@@ -17,8 +17,8 @@ TITLES = {"roam360": "360Roam", "ricoh360": "Ricoh360"}
 SCENES = {"center_1": "center1"}  # names in the file -> names of the folders, where they differ
 AVERAGE = "average"
 BUILT_IN = "synthetic"  # data set of the generated scenes; their names begin with it
-NEVER_SEEN, TUNED_ON = "never seen", "tuned on"
-SEEN = {  # beginning of the fingerprint of a capture, or name of a generated scene -> NEVER_SEEN or TUNED_ON
+NOT_TUNED_ON, TUNED_ON = "not tuned on", "tuned on"
+SEEN = {  # beginning of the fingerprint of a capture, or name of a generated scene -> NOT_TUNED_ON or TUNED_ON
     data: kind.replace("_", " ")
     for kind, scenes in yaml.safe_load((FILE.parent.parent / "conf" / "tuned_on.yaml").read_text("utf-8")).items()
     for known in scenes.values()
@@ -53,7 +53,7 @@ class Place:
     dataset: str
     scene: str
     apart: str = ""  # condition that separates its runs from others of the scene
-    seen: str = ""  # NEVER_SEEN or TUNED_ON, or nothing where it is not known whether settings were chosen on the scene
+    seen: str = ""  # NOT_TUNED_ON, TUNED_ON, or nothing where it is not known whether settings were chosen on it
 
     @classmethod
     def of(cls, dataset: str, scene: str, fingerprint: str) -> Place:
@@ -111,8 +111,8 @@ class Place:
 
     @property
     def rank(self) -> tuple[int, int, str, str, str]:
-        """Sort key: scenes of the paper first, then those never seen, then by name, and those tuned on last."""
-        order, seen = list(DATASETS), (NEVER_SEEN, "", TUNED_ON).index(self.seen)
+        """Sort key: scenes of the paper first, then those not tuned on, then by name, and those tuned on last."""
+        order, seen = list(DATASETS), (NOT_TUNED_ON, "", TUNED_ON).index(self.seen)
         first = order.index(self.dataset) if self.published else len(order)
         return first, seen, self.dataset, self.scene, self.apart
 

@@ -29,7 +29,7 @@ CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
 PROTOCOL = "stability"
 QUALITY, ONE_COLOR = f"{PROTOCOL}/ws_psnr", f"{PROTOCOL}/ws_psnr_one_color"
 EQUATOR, POLE = f"{PROTOCOL}/ws_psnr_equator", f"{PROTOCOL}/ws_psnr_pole"
-SHARED = ("resolution", "learning_rates", "data", "machine")
+SHARED = ("resolution", "learning_rates", "data", "machine", f"{PROTOCOL} rules")
 SCORES = ("stability_score", "worst_quartile", "failure_rate")  # of a `StressedMethod`
 NOT_SCORED = {"textureless"}  # shown but not scored, because the scene becomes easier
 HALF = 0.5  # a condition breaks a method below this robustness
@@ -55,7 +55,8 @@ UNSTRESSED = {  # title -> column of the frame, and columns that are subtracted 
 }
 STABILITY_NOTES = (
     "Robustness: how far above one colour for the image a run stays under a condition, as a share of the same "
-    "method and seed without it, within [0, 1]; 0 for a run that failed. Level 1 is mild, 3 is severe.",
+    "method and seed without it (the mean of other seeds where that has no such run), within [0, 1]; 0 for a run that "
+    "failed. Level 1 is mild, 3 is severe.",
     f"A method breaks at the first level where it keeps less than {HALF:g} or a run fails; – where it does not.",
     "Score: the mean over conditions of the mean over their levels. Worst quartile: that of the worst quarter of the "
     "conditions; columns stand in its order on the first scene, the best first. Both, and the failure rate, are over "
@@ -63,8 +64,9 @@ STABILITY_NOTES = (
     "conditions of the scene.",
 )
 LIMITS_NOTES = (
-    "dB: WS-PSNR without the condition less that with it, of the same seed; after a fit of colours: each view with the "
-    "gain and the offset of each channel that bring it nearest to the truth. Other rows: the metric itself.",
+    "dB: WS-PSNR without the condition less that with it, of the same seed (the mean of other seeds where that has no "
+    "such run); after a fit of colours: each view with the gain and the offset of each channel that bring it nearest "
+    "to the truth. Other rows: the metric itself.",
     "BEYOND: more than a method that is meant to be robust may lose; – in the first column: no limit.",
 )
 

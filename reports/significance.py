@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from pandas import DataFrame
 
 from padgs.reports.measures import Measure
 from padgs.reports.published import Place
+from padgs.reports.selection import Setting
 from padgs.reports.table import Block, Cell, Column, Row, format_number
 
 BEST, SECOND = "best", "second"
@@ -28,6 +29,12 @@ def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:
     """Return a cell for each measure: mean and deviation over successful runs, and the status of failed ones."""
     failed = failures(runs)
     return [mean_cell(column[~np.isnan(column)].tolist(), failed) for column in numbers_of(runs, measures).T]
+
+
+def failure_notes(found: Iterable[Setting]) -> list[str]:
+    """Return a sentence that names the settings with failed runs; none if all ended well."""
+    failed = [f"{one.title} ({words.upper()})" for one in found if (words := failures(one.runs))]
+    return [f"Failed runs are left out: {'; '.join(failed)}."] if failed else []
 
 
 def failures(runs: DataFrame) -> str:
@@ -87,8 +94,8 @@ def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int,
     column, every = columns[index], ((i, row.cells[index]) for i, row in enumerate(block.rows))
     cells = {i: cell for i, cell in every if cell.value is not None and cell.ranked}
     sign = -1.0 if column.higher_is_better else 1.0
-    few = min((sign * (cell.value or 0.0) for cell in cells.values() if cell.count < SEEDS), default=math.inf)
-    shared = places({i: cell for i, cell in cells.items() if cell.count >= SEEDS}, column)
+    few = min((sign * (cell.value or 0.0) for cell in cells.values() if _few(cell)), default=math.inf)
+    shared = places({i: cell for i, cell in cells.items() if not _few(cell)}, column)
     found: dict[int, str] = {}
     for rank, rows in zip((BEST, SECOND), shared if len(shared) > 1 else (), strict=False):
         numbers = [sign * (cells[i].value or 0.0) for i in rows]
@@ -96,6 +103,11 @@ def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int,
             break
         found |= dict.fromkeys(rows, rank)
     return found
+
+
+def _few(cell: Cell) -> bool:
+    """Return whether a cell has too few seeds for a mark, or failed runs, without which its mean is too good."""
+    return cell.count < SEEDS or bool(cell.status)
 
 
 def places(cells: Mapping[int, Cell], column: Column) -> list[list[int]]:

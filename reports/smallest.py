@@ -11,7 +11,7 @@ from pandas import DataFrame
 
 from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, set_axis, spans, styled
 from padgs.reports.conditions import OF_TIMES, footnotes, sheets
-from padgs.reports.selection import RunSet, settings
+from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import mean_cell
 from padgs.reports.store import split_image
 from padgs.reports.table import Block, Column, Row, Table
@@ -80,7 +80,7 @@ def curves(runs: DataFrame) -> list[Curve]:
     found = []
     for setting in settings(runs.sort_values("seed", kind="stable")):
         several = runs.loc[runs["preset"] == setting.preset, "seed"].nunique() > 1
-        for run in setting.runs.to_dict("records"):
+        for run in one_setting(setting.runs, setting.title).to_dict("records"):
             title = setting.title + (f", seed {run['seed']}" if several else "")
             image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
             found.append(Curve(title, setting.title, setting.preset, run["smallest"], image))

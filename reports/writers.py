@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,11 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
         if made.numbers is not None:
             yield f"{name}.csv", made.numbers.to_csv(index=False, lineterminator="\n").encode()
     else:
+        names: set[str] = set()
         for part in made:
+            if isinstance(part, Chart) and (name := file_name(part.name)) in names:  # of scenes such as a/b and a-b
+                part = replace(part, name=f"{name}-{hashlib.sha256(part.title.encode()).hexdigest()[:9]}")
+            names.add(file_name(part.name))
             yield from files(part, svg)
 
 

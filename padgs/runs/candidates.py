@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from padgs.evaluation.evaluate import MOST_DECIBELS
 from padgs.evaluation.metrics import BANDS, band_rows, sphere_weight
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.results import Scores
@@ -87,12 +88,12 @@ def band_shares(view: View) -> dict[str, float]:
 
 
 def differences(candidate: Scores, control: Scores, metric: str) -> dict[str, float]:
-    """Return candidate minus control for each view that both have the metric of; 0 where both are perfect."""
+    """Return candidate minus control for each view that both have the metric of; exact ones have `MOST_DECIBELS`."""
     found = {}
     for name, view in control.views.items():
         new, old = candidate.views[name].get(metric), view.get(metric)
         if new is not None and old is not None:
-            found[name] = 0.0 if new == old else new - old
+            found[name] = min(new, MOST_DECIBELS) - min(old, MOST_DECIBELS)
     return found
 
 

@@ -10,8 +10,8 @@ from padgs.reports.charts import drawing
 from padgs.reports.charts.drawing import MARKERS, Chart, Label, color_of, set_axis, styled, weight_of
 from padgs.reports.conditions import footnotes, sheets
 from padgs.reports.measures import costs, metric
-from padgs.reports.selection import RunSet, one_setting
-from padgs.reports.significance import over_seeds
+from padgs.reports.selection import RunSet, one_setting, settings
+from padgs.reports.significance import failure_notes, over_seeds
 from padgs.reports.specs import BUDGET, PREPARE
 from padgs.reports.table import Cell
 
@@ -38,7 +38,8 @@ def charts(run_set: RunSet) -> list[Chart]:
     for name, title, own in sheets(runs, run_set.request, "capacity", ("protocol", "data", "learning_rates")):
         points = [point for preset in methods.ordered(own["preset"]) for point in _points(own, preset, title)]
         if len({point.limit for point in points}) > 1:
-            found.append(_chart(name, title, points, tuple(footnotes({title: own}, "sphere"))))
+            notes = (*footnotes({title: own}, "sphere"), *failure_notes(settings(own)))
+            found.append(_chart(name, title, points, notes))
     return found
 
 

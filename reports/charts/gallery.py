@@ -4,13 +4,14 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from pandas import DataFrame
 from PIL import Image, ImageDraw, ImageFont
 
 from padgs.reports import methods
 from padgs.reports.charts.drawing import INK, PAPER, Chart, wrap_title
 from padgs.reports.conditions import footnotes, sheets
-from padgs.reports.selection import RunSet
+from padgs.reports.selection import RunSet, one_setting
 from padgs.reports.store import render_names, split_image
 
 COLUMNS = 3
@@ -23,7 +24,8 @@ def charts(run_set: RunSet) -> list[Chart]:
     runs, found = run_set.chosen("gallery"), []
     runs = runs.loc[runs["ok"] & (runs["variant"] == "") & (runs["renders"].map(render_names).map(len) > 0)]
     for name, where, own in sheets(runs, run_set.request, "gallery", ("protocol", "data")):
-        own = own.sort_values("seed", kind="stable").drop_duplicates("preset")
+        alike = (one_setting(of, f"{where}, {methods.title(preset)}", "preset") for preset, of in own.groupby("preset"))
+        own = pd.concat([of.head(1) for of in alike])
         shared = sorted(set.intersection(*(set(render_names(folder)) for folder in own["renders"])))
         if shared and (images := _images(own, view := shared[len(shared) // 2], run_set.warnings)):
             title = f"{where}\ntest view {Path(view).stem}, below each render its error, with the PSNR of this view"

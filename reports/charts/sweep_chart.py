@@ -14,7 +14,7 @@ from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_m
 from padgs.reports.frame import by_place, grouped
 from padgs.reports.measures import Measure, costs, metrics, quantity
 from padgs.reports.published import Place
-from padgs.reports.selection import Request, RunSet, Setting, experiment_of, is_number, settings, sort_key
+from padgs.reports.selection import Request, RunSet, Setting, experiment_of, is_number, one_setting, settings, sort_key
 from padgs.reports.significance import over_seeds
 from padgs.reports.table import Cell
 from padgs.results import AD_HOC
@@ -104,6 +104,7 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
             for preset, fixed, key, points in parts:
                 for _, setting in points:
                     refuse_mixture(setting.runs, request, f"{name}, {place.title}, {setting.title}", OF_A_POINT)
+                    one_setting(setting.runs, f"{name}, {place.title}, {setting.title}")
                 cells = tuple((x, over_seeds(setting.runs, measures)) for x, setting in points)
                 curves.append(Curve(place, preset, fixed, key, cells))
         if curves:

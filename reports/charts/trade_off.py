@@ -13,7 +13,7 @@ from padgs.reports.frame import by_place, without_data
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, one_setting, settings
-from padgs.reports.significance import failures, over_scenes
+from padgs.reports.significance import failure_notes, over_scenes
 from padgs.reports.table import Cell
 from padgs.results import file_name
 
@@ -76,7 +76,7 @@ class TradeOff:
             for title, cell in point.numbers.items()
             if cell.value is not None
         ]
-        return DataFrame(rows, dtype=object).drop(columns="status").rename(columns={"value": "mean"})
+        return DataFrame(rows, dtype=object).rename(columns={"value": "mean"})
 
 
 def trade_offs(run_set: RunSet) -> list[TradeOff]:
@@ -105,7 +105,7 @@ def trade_offs(run_set: RunSet) -> list[TradeOff]:
 def equal_times(run_set: RunSet) -> list[TradeOff]:
     """Return a chart for each scene, resolution and time of `+experiment=equal_time` with at least `FEWEST` methods.
 
-    Means over the scenes of a resolution and time come first, of those never seen, those tuned on, and all others.
+    Means over the scenes of a resolution and time come first, of those not tuned on, those tuned on, and all others.
     """
     runs, found = run_set.of_experiments("equal_time"), []
     shown = replace(run_set.request, protocol=_protocol(runs))
@@ -155,7 +155,6 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
         for place, own in by_place(setting.runs).items():
             one_setting(own, f"{place.title}, {setting.title}")
     found = [setting for setting in every if setting.runs["ok"].any()]
-    failed = [f"{one.title} ({failures(one.runs).upper()})" for one in every if not one.runs["ok"].any()]
     finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]
     if len(group) == 1:
         finished = list(group)  # a setting that failed has no point
@@ -171,8 +170,7 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
         named = ", ".join(place.scene for place in finished)
         what = f"{what}, mean over its scenes {named}" if what else f"mean over {named}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
-    notes = footnotes({what: shown}, request.protocol)
-    notes += [f"Every run failed, so there is no point: {'; '.join(failed)}."] if failed else []
+    notes = footnotes({what: shown}, request.protocol) + failure_notes(every)
     return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes), equal_images)
 
 

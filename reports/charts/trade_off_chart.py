@@ -160,19 +160,26 @@ def _named(trade_off: TradeOff, curves: Sequence[Any], low: float, high: float) 
 
 
 def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]]]:
-    """Return seconds and PSNR of each setting, evaluation by evaluation, as means over its runs with a complete log.
+    """Return seconds and PSNR of each setting, evaluation by evaluation: means over scenes, of means over seeds.
 
-    Logs have wall time, which is scaled so that it ends with the run's CPU time where that is known.
+    Runs without a complete log are left out, and settings without a run in a scene. Logs have wall time, which is
+    scaled so that it ends with the run's CPU time where that is known.
     """
-    found = []
-    for setting in settings(trade_off.runs):
+    found, places = [], trade_off.runs["place"].unique()
+    for setting in settings(trade_off.runs.loc[trade_off.runs["ok"]]):
         scales = (setting.runs["train_seconds"] / setting.runs["wall_seconds"]).fillna(1.0)
-        logs = [(log, scale) for log, scale in zip(setting.runs["log"], scales, strict=True) if log["psnr"]]
-        count = max((len(log["psnr"]) for log, _ in logs), default=0)
-        complete = [(log, scale) for log, scale in logs if len(log["psnr"]) == count]  # others would cut the mean
-        if complete:
-            seconds = np.mean([scale * np.array(log["seconds"]) for log, scale in complete], 0).tolist()
-            psnr = np.mean([log["psnr"] for log, _ in complete], 0).tolist()
+        logs = [*zip(setting.runs["place"], setting.runs["log"], scales, strict=True)]
+        count = max(len(log["psnr"]) for _, log, _ in logs)  # others would cut the mean
+        of_scenes = [
+            [
+                (scale * np.array(log["seconds"]), log["psnr"])
+                for at, log, scale in logs
+                if at == place and len(log["psnr"]) == count
+            ]
+            for place in places
+        ]
+        if count and all(of_scenes):
+            seconds, psnr = np.mean([np.mean(of, axis=0) for of in of_scenes], axis=0).tolist()
             found.append((setting, *without_dips(seconds, psnr)))
     return found
 

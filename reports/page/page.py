@@ -155,7 +155,7 @@ def _facts(runs: DataFrame) -> list[tuple[str, str]]:
 
 
 def _scene_sets(runs: DataFrame) -> dict[str, list[str]]:
-    """Return title -> names of scenes: those never seen and tuned on, each data set, and each scene."""
+    """Return title -> names of scenes: those not tuned on and tuned on, each data set, and each scene."""
     sets: dict[str, list[str]] = {}
     for place in by_place(runs):
         for title in filter(None, (place.seen, TITLES.get(place.dataset, place.dataset))):

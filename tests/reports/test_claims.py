@@ -22,6 +22,7 @@ from padgs.reports.claims import (
 )
 from padgs.reports.methods import title
 from padgs.reports.selection import Mixture
+from padgs.reports.table import ReportError
 
 SCENES = ("synthetic-room", "synthetic-cave", "synthetic-den", "synthetic-hut", "synthetic-loft", "synthetic-shed")
 BETTER, WORSE = ([1, 1.1], [2, 2.1], [1.5, 1.4]), ([-1, -1.1], [-2, -2.1], [-1.5, -1.4])
@@ -70,9 +71,20 @@ def test_a_scene_with_one_seed_of_a_side_is_listed_and_not_tested():
     for made in (against([1], [2], [3], seeds=1), against([1], [2], [3]), against(*BETTER, seeds=1)):
         found = evidence(made)
         assert (found.interval, found.verdict, len(found.scenes), len(found.tested)) == (None, UNDECIDED, 3, 0)
-    found = evidence([*against(*BETTER[:2]), *against([], [], [9], seeds=1)])
+    third = [run for run in against([], [], [9], seeds=1) if run.scene == SCENES[2]]
+    found = evidence([*against(*BETTER[:2]), *third])
     assert list(found.tested["scene"]) == ["synthetic-cave", "synthetic-room"] and found.verdict == UNDECIDED
     assert evidence(against(BETTER[0])).interval is None, "one scene"
+
+
+def test_no_scene_is_lost_to_another_setting_and_no_copy_of_a_run_is_a_seed():
+    first, *_ = made = against(*BETTER)
+    other = replace(first, run="other", config={**first.config, "method": {"tau": 0.5}})
+    with pytest.raises(ReportError, match="differ in method.tau; choose one with --where method.tau="):
+        evidence([*made, other])
+    rival = next(run for run in made if run.preset == "omnigs")
+    with pytest.raises(ReportError, match="and copy are the same setting; delete one of them"):
+        evidence([*made, replace(rival, run="copy")])
 
 
 def test_verdicts():
@@ -90,7 +102,7 @@ def test_verdicts():
     assert verdict(against(*BETTER), scenes="outdoor") == UNMEASURED
 
 
-def test_scenes_never_seen_decide_claims_of_our_own_alone_where_there_are_any():
+def test_scenes_not_tuned_on_decide_claims_of_our_own_alone_where_there_are_any():
     others = [
         replace(run, dataset="", scene=scene, fingerprint=data, run=f"{scene}{run.run}")
         for scene, data, gains in (("plaza", "da838962d5", BETTER[0]), ("basement", "76aa9660be", BETTER[1]))

@@ -76,6 +76,15 @@ def test_the_layout_is_the_papers_and_the_best_is_sought_along_a_row():
     assert {"PaD-GS", "OmniGS"} <= {line["column"] for line in heads if line["block"].startswith("PSNR")}
 
 
+@pytest.mark.parametrize("scene", ["bar", "base"])
+def test_a_method_that_one_scene_lacks_keeps_its_numbers_in_others(scene):
+    made = [result("", scene=one, run=one, fingerprint=one) for one in ("bar", "base")]
+    found = across([*made, result("", method="odgs", psnr=21.0, scene=scene, run="odgs", fingerprint=scene)])
+    other = "base" if scene == "bar" else "bar"
+    assert found[scene]["ODGS, corrected"] == "21.00" and found[other]["ODGS, corrected"] == MISSING
+    assert MISSING not in (found[f"{one}, paper"]["ODGS, corrected"] for one in ("bar", "base"))
+
+
 @pytest.mark.parametrize("other", [{"width": 512, "height": 256}, {"iterations": 7000}])
 def test_there_is_a_difference_at_the_size_and_length_of_the_paper_only(other):
     assert "bar, Δ" not in across([result("", **other)])

@@ -201,3 +201,10 @@ def test_without_stress_there_are_no_tables():
 def test_limits_are_those_of_the_conditions():
     read = {name: (limit.get("metric", "ws_psnr"), limit.get("allowed", ())) for name, limit in LIMITS.items()}
     assert read == {name: (condition.metric, condition.allowed) for name, condition in CONDITIONS.items()}
+
+
+def test_scores_by_other_rules_are_not_mixed():
+    first, *others = runs()
+    cropped = replace(first.scores["stability"], protocol={**RULES, "bottom_crop": 0.25})
+    with pytest.raises(ReportError, match="differ in stability rules"):
+        stability(run_set([replace(first, scores={"stability": cropped}), *others]))

@@ -55,7 +55,7 @@ def test_depth_has_columns_where_a_run_was_scored_by_it_and_is_chosen_by_name():
     assert [column.heading for column in chosen.columns] == ["depth δ < 1.25 ↑"]
 
 
-def test_scenes_tuned_on_and_never_seen_stand_apart():
+def test_scenes_tuned_on_and_not_stand_apart():
     known = {
         "room": "e7acbfd00c",
         "flat": "7564c90d88",
@@ -69,15 +69,15 @@ def test_scenes_tuned_on_and_never_seen_stand_apart():
     ]
     table = methods(run_set(made))
     assert [block.title for block in table.blocks] == [
-        "Average over 2 scenes never seen: basement, plaza",
+        "Average over 2 scenes not tuned on: basement, plaza",
         "Average over 2 scenes tuned on: flat, room",
-        "basement (never seen)",
-        "plaza (never seen)",
+        "basement (not tuned on)",
+        "plaza (not tuned on)",
         "garden",
         "flat (tuned on)",
         "room (tuned on)",
     ]
-    assert "never seen: none was, but for the exceptions" in "".join(table.notes)
+    assert "not tuned on: none was, but for the exceptions" in "".join(table.notes)
     assert "tuned" not in markdown(methods(run_set(made[-1:])))
 
 

@@ -89,3 +89,9 @@ def test_what_is_not_ranked_neither_stands_out_nor_stands_in_the_way():
     assert ranks(PSNR, ONE, aside, TWO) == {2: BEST, 0: SECOND}
     assert Row("A", (aside, Cell())).texts((PSNR, PSNR)) == ["A †", "9.00", "–"]
     assert Row("A", (Cell(1.0), aside)).texts((PSNR, PSNR)) == ["A", "1.00", "9.00 †"]
+
+
+def test_what_failed_on_a_seed_is_not_marked_and_stands_in_the_way_where_it_would_be_best():
+    failing = Cell(40.0, 0.1, 3, "oom")
+    assert ranks(PSNR, ONE, TWO, failing) == {}
+    assert ranks(PSNR, Cell(5.0, 0.1, 3, "oom"), ONE, TWO) == {2: BEST, 1: SECOND}

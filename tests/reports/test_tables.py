@@ -285,6 +285,27 @@ def test_each_deviation_beside_the_method_as_described():
     assert changes["as released"] == pytest.approx(-3) and changes["limit on scales"] is None
 
 
+def test_a_difference_is_of_the_seeds_that_both_rows_have():
+    psnr = {"padgs": (30.0, 30.0, 20.0), "padgs_distance": (29.0, 29.0)}
+    made = [(name, seed, quality) for name, of in psnr.items() for seed, quality in enumerate(of)]
+    made = [
+        replace(small(v, seed=s), variant=name, run=f"{name}{s}", experiments=("deviations",)) for name, s, v in made
+    ]
+    lost = replace(made[-1], run="lost", seed=2, status="nan", scores={}, config={**made[-1].config, "seed": 2})
+    table = deviations(run_set([*made, lost]))
+    assert value(table, "PaD-GS", "distance in world units", "Δ") == pytest.approx(-1.0)
+
+
+def test_the_best_stands_first_by_a_metric_that_falls():
+    (block,) = order(run_set(ordered(), metrics=("lpips_vgg_01",))).blocks
+    assert [row.cells[0].value for row in block.rows] == [1, 2, 2, 4]
+
+
+def test_a_metric_without_a_protocol_is_of_the_one_asked_for():
+    table = modulation(run_set(crossed(), protocol="sphere", metrics=("psnr",)))
+    assert columns(table) == ["PSNR"]
+
+
 def test_rows_that_seeds_cannot_separate_share_a_rank_and_the_best_stands_first():
     (block,) = order(run_set(ordered())).blocks
     expected = {"spags_sorted": 1, "odgs": 2, "omnigs": 2, "op43dgs": 4}  # in the order of the means

@@ -4,9 +4,11 @@ import subprocess
 from dataclasses import replace
 
 import pytest
+from PIL import Image
 from support.made_up import builder, data_set, failed, result, run_set
 
-from padgs.reports.writers import _line, latex
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.writers import _line, files, latex
 
 runs = builder("runs")
 table1 = builder("table1")
@@ -72,3 +74,9 @@ def test_they_compile(tmp_path):
     assert "Undefined control sequence" not in done.stdout
     too_wide = re.findall(r"Overfull .hbox .([\d.]+)pt too wide. in alignment", done.stdout)
     assert max(map(float, too_wide), default=0) < 1
+
+
+def test_charts_of_scenes_whose_names_differ_in_signs_only_have_files_of_their_own():
+    charts = [Chart("chart_a/b", "a/b", Image.new("RGB", (1, 1))), Chart("chart_a-b", "a-b", Image.new("RGB", (1, 1)))]
+    names = [name for name, _ in files(charts)]
+    assert names[0] == "chart_a-b.png" and re.fullmatch(r"chart_a-b-[0-9a-f]{9}\.png", names[1])

@@ -117,6 +117,12 @@ def test_each_rule_objects_by_name(changed, reasons):
     assert len(found) == len(reasons) and all(map(str.startswith, found, reasons)), found
 
 
+def test_exact_views_have_a_finite_loss():
+    control, other = candidate(100, math.inf, math.inf, 40), candidate(50, math.inf, 60, 40)
+    assert rules.loss([control], other) == pytest.approx(40 / 3), "100 dB at most, as in means"
+    assert "may fall by nan" not in "".join(objections(other.scores, control.scores, 1.0, shares(3)))
+
+
 def test_the_bound_is_that_of_students_t():
     # mean 0, s = 0.1, n = 3: t(0.95, 2) = 2.920; -2.920 * 0.1 / sqrt(3)
     assert lower_bound([0.1, 0.0, -0.1]) == pytest.approx(-0.16859, abs=1e-5)

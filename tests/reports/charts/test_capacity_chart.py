@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.made_up import budgets, run_set
@@ -14,6 +16,12 @@ def test_each_method_has_a_curve_that_is_within_the_axes_even_if_it_falls():
     assert curve == pytest.approx(np.array([[9999.5, 29.65], [19999.5, 19.65]])) and low < 19.5 and high > 30.7
     assert {text.get_text() for text in made.figure.texts} >= {"OmniGS", "ODGS"}
     assert made.numbers.loc[made.numbers["preset"] == "omnigs", "limit"].tolist() == [10_000, 20_000]
+
+
+def test_failed_runs_are_named():
+    made = budgets({("omnigs", 10_000): 30.0, ("omnigs", 20_000): 31.0})
+    (chart,) = charts(run_set([*made[:-1], replace(made[-1], status="oom", scores={})]))
+    assert chart.notes[-1] == "Failed runs are left out: OmniGS, corrected, gaussians 20000 (OOM)."
 
 
 def test_runs_with_one_limit_have_no_chart():

@@ -11,6 +11,7 @@ from padgs.reports import store
 from padgs.reports.charts import gallery
 from padgs.reports.frame import frame
 from padgs.reports.selection import RunSet
+from padgs.reports.table import ReportError
 from padgs.results import Scores
 
 
@@ -61,3 +62,10 @@ def test_runs_without_a_readable_render_are_left_out(tmp_path, written):
     for file in tmp_path.rglob("*.png"):
         file.write_bytes(b"cut")
     assert sheets(tmp_path) == sheets(write([first], tmp_path / "none")) == []
+
+
+def test_two_settings_of_a_method_do_not_stand_for_each_other(tmp_path):
+    first, *_ = compared(["synthetic-room"], seeds=1)
+    other = replace(first, run="other", config={**first.config, "method": {"tau": 0.0}})
+    with pytest.raises(ReportError, match="differ in method.tau"):
+        sheets(write([first, other], tmp_path, renders=True))

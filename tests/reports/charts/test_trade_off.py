@@ -122,6 +122,20 @@ def test_quality_over_training_time_comes_from_the_logs(tmp_path, monkeypatch):
     assert time_chart(one(runs)) is None, "no quality over time without a log"
 
 
+def test_a_curve_is_a_mean_over_scenes_and_of_finished_runs(tmp_path):
+    def many(method, scene, psnr, seeds):
+        own = {"method": method, "dataset": "roam360", "scene": scene, "fingerprint": scene}
+        return [small(psnr, seed=seed, run=f"{scene}{method}{seed}", **own) for seed in range(seeds)]
+
+    made = [*many("padgs", "bar", 30, 3), *many("padgs", "base", 20, 3)]
+    made += [*many("omnigs", "bar", 30, 3), *many("omnigs", "base", 20, 1)]
+    made.append(replace(many("spags", "bar", 34, 1)[0], status="degenerate"))
+    (logged,) = trade_offs(RunSet(frame(store.read(write(made, tmp_path))[0])))
+    ends = {setting.preset: psnr[-1] for setting, _, psnr in trade_off_chart._curves(logged)}
+    assert ends == pytest.approx(dict.fromkeys(("omnigs", "padgs"), 25 - 8 / 15))
+    assert logged.notes[-1] == "Failed runs are left out: SPaGS (DEGENERATE)."
+
+
 def test_time_is_cpu_time_where_that_is_known(tmp_path, monkeypatch):
     ends = []
     monkeypatch.setattr(trade_off_chart, "write_labels", lambda _, __, marks: ends.extend(x for x, *_ in marks))
@@ -173,7 +187,7 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_settings_finished():
     assert numbers(chart)["OmniGS, corrected", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
     (chart,) = trade_offs(run_set(failed(data_set("roam360"), lambda r: r.method == "padgs")))
     assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
-    assert chart.notes[-1] == "Every run failed, so there is no point: PaD-GS (OOM)."
+    assert chart.notes[-1] == "Failed runs are left out: PaD-GS (OOM)."
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def test_scenes_can_be_chosen_by_set_and_by_name():
     ]
     runs = run_set([*compared(["synthetic-room", "synthetic-outdoor"], 1), *own]).runs
     sets = page._scene_sets(runs)
-    assert sets["never seen"] == ["plaza"] and sets["synthetic-room"] == ["synthetic-room"]
+    assert sets["not tuned on"] == ["plaza"] and sets["synthetic-room"] == ["synthetic-room"]
     assert sorted(sets["synthetic"]) == ["synthetic-outdoor", "synthetic-room"]
 
 
