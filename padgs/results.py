@@ -252,7 +252,7 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     """
     document = dict(document)
     if document.pop("schema") != SCHEMA:
-        raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); run again with this one")
+        raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); delete it and run again")
     digest = document.pop("sha256", None)
     try:
         edited = digest != _digest(document)

@@ -220,18 +220,14 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             raise ReportError(str(mixture)) from mixture
         if row := _beside_best(claim, own, others.select(alike), where):
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
-            row |= {
-                "place": found["place"],
-                "scene": found["place"].label,
-                "seen": found["place"].seen,
-                "size": size,
-                "length": length,
-            }
+            place = found["place"]
+            row |= {"place": place, "scene": place.label, "seen": place.seen, "size": size, "length": length}
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)
-            row["failed"] = failures(ours.select(runs.loc[runs["place"] == found["place"]]))
-            rank, of = itemgetter("tested", "width", "iterations"), row["place"]
-            scene = (of.dataset, of.scene.replace(OTHER_PATH, ""), of.seen if of.dataset != published.BUILT_IN else "")
+            row["failed"] = failures(ours.select(runs.loc[runs["place"] == place]))
+            rank = itemgetter("tested", "width", "iterations")
+            kind = place.seen if place.dataset != published.BUILT_IN else ""
+            scene = (place.dataset, place.scene.replace(OTHER_PATH, ""), kind)
             best[scene] = max(row, best.get(scene, row), key=rank)
     rows = DataFrame(sorted(best.values(), key=lambda row: row["place"].rank))
     if claim.source == OURS and len(rows) and (untuned := rows["tested"] & (rows["seen"] == NOT_TUNED_ON)).any():

@@ -38,7 +38,7 @@ from padgs.results import flat
 from padgs.runs.console import say, show_result
 from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import build_method, initial_result, load_scene, scored, start
-from padgs.runs.store import Progress, RunStore
+from padgs.runs.store import Labels, Progress, RunStore
 from padgs.runs.warm_start import WarmStart
 from padgs.scene import Scene, View
 from padgs.training.model import MODEL, State
@@ -278,6 +278,8 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
         first.config,
         data=replace(first.config.data, **whole),
         variant=", ".join(filter(None, (first.config.variant, blocks))),
+        labels=Labels(first.result.preset if first.result else first.config.method),
+        run=replace(first.config.run, folder=str(first.folder.resolve().parent)),
         init=WarmStart(" ".join(str(run.folder) for run in runs), together),
     )
     scene = load_scene(config, start(config))

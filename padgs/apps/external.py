@@ -188,12 +188,19 @@ def open_model(
     if not is_splat_file(path):
         if transform or rays != "exact":
             raise ValueError(f"{path} is a run, whose renderer and world are known; leave out --rays and --transform")
-        return load_run(path, data_path=data, device=device)
+        return replace(load_run(path, data_path=data, device=device), opened_with=options_of(data, rays, transform))
     config = None if data is None else config_of(data, device=device)
     run = ExternalRun.open(Path(path), config, rays, transform, device)
+    run.opened_with = options_of(data, rays, transform)
     if config is not None and not (found := run.check()).fits:
         run.notes += (str(found),)
     return run
+
+
+def options_of(data: str | None, rays: str, transform: str) -> tuple[str, ...]:
+    """Return the options of a command line that opens a model like `open_model` with these values."""
+    given = {"--data": data, "--rays": "" if rays == "exact" else rays, "--transform": transform}
+    return tuple(word for option, value in given.items() if value for word in (option, value))
 
 
 def scene_without_photographs(splats: Splats, file: Path) -> Scene:

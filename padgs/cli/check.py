@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.errors import Depth, Format, Images, Mask, Points, Split, show
+from padgs.cli.errors import Cameras, Depth, Format, Images, Mask, Points, Split, show
 
 if TYPE_CHECKING:
     from padgs.data.check import Report
@@ -22,7 +22,7 @@ def check(
     depth: Depth = "auto",
     images: Images = "",
     points: Points = "auto",
-    cameras: Annotated[str, typer.Option(help="all, or panoramas: leave out images of other cameras")] = "all",
+    cameras: Cameras = "all",
     split: Split = "auto",
 ) -> None:
     """Check a data set and list its problems. Exit code 1 if there are any."""

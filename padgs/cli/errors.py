@@ -32,6 +32,7 @@ Mask = Annotated[
 Depth = Annotated[str, typer.Option(help="auto, or none: ignore depth maps")]
 Points = Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of starting points")]
 Images = Annotated[str, typer.Option(help="image folder, if not the usual one")]
+Cameras = Annotated[str, typer.Option(help="all, or panoramas: leave out images of other cameras")]
 Split = Annotated[str, typer.Option(help="how to choose held-out views: auto, files, every or all (none held out)")]
 MAX_SEED, MAX_THREADS = 2**32 - 1, max(64, 4 * (os.cpu_count() or 1))
 

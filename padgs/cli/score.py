@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Format, Images, Mask, Rays, Split, Transform, check_range, show
+from padgs.cli.errors import Cameras, Format, Images, Mask, Rays, Split, Transform, check_range, show
 
 
 def score(
@@ -19,6 +19,7 @@ def score(
     width: Annotated[int, typer.Option(help="reduce the photographs to this width; 0: as they are")] = 0,
     mask: Mask = "",
     images: Images = "",
+    cameras: Cameras = "",
     split: Split = "",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
@@ -44,7 +45,7 @@ def score(
         raise FileNotFoundError(f"there is no {model}; give a file of Gaussians, or a folder of renders")
     if not path.is_dir() and not is_splat_file(model):
         raise ValueError(f"{model} is no .ply, .compressed.ply, .spz or .sog, and no folder of renders")
-    settings = {"format": format, "width": width, "mask": mask, "images": images, "split": split}
+    settings = {"format": format, "width": width, "mask": mask, "images": images, "cameras": cameras, "split": split}
     with console.status("opening the data set") as status:
         config = config_of(data, device=device, **settings)
         if path.is_dir():

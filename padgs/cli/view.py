@@ -54,5 +54,8 @@ def view(
     try:
         serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
     except KeyboardInterrupt:  # the way to end it
-        show(f"next: {shlex.join(['padgs', 'render', run])}  (--path film.json after saving a film)")
+        from padgs.apps.external import options_of
+
+        command = shlex.join(["padgs", "render", run, *options_of(data, rays, transform)])
+        show(f"next: {command}  (--path film.json after saving a film)")
         raise

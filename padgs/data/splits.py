@@ -11,6 +11,7 @@ from padgs.data.images import EXTENSIONS, read_bytes
 
 MAX_NAME_BYTES = 255  # of a file name
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # first bytes of what Windows calls Unicode
+Names = Sequence[str]
 LISTS = {"train": "train.txt", "test": "test.txt"}
 
 
@@ -24,14 +25,14 @@ class Split:
 
 
 def split_frames(
-    names: Sequence[str],
+    names: Names,
     folder: Path,
     *,
     mode: str = "auto",
     every: int = 8,
     stated: Mapping[str, tuple[str, ...]] | None = None,
-    unposed: Sequence[str] = (),
-    left_out: Sequence[str] = (),
+    unposed: Names = (),
+    left_out: Names = (),
 ) -> Split:
     """Decide for each frame whether it is a training view, a test view, or unused.
 
@@ -123,7 +124,7 @@ def spellings(name: str) -> Iterator[str]:
             yield end.rpartition(".")[0]
 
 
-def _every(names: Sequence[str], every: int, mode: str) -> Split:
+def _every(names: Names, every: int, mode: str) -> Split:
     test = tuple(range(0, len(names), every))
     train = tuple(i for i in range(len(names)) if i % every)
     if not train:
@@ -135,9 +136,7 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
     return Split(train, test, (f"split: every {every}th view is a test view ({why})",))
 
 
-def _resolve(
-    lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str], left_out: Sequence[str]
-) -> set[int]:
+def _resolve(lines: Names, names: Names, which: str, unposed: Names, left_out: Names) -> set[int]:
     meant: dict[str, set[int]] = {}
     for i, name in enumerate(names):
         for key in spellings(name):

@@ -24,8 +24,9 @@ FOLDER = ".multirun"  # in run.folder
 FILE_NAME = "finished.jsonl"
 # Settings that decide nothing about training, or only whether and where it is done.
 IGNORED = (*results.OF_THE_MACHINE, "launcher", "tracking", "retry", "hydra")
-# Files outside `data.path`: another run, which may have another model by now, and files beside the data.
-OTHER_FILES = re.compile(r"\+*(init[.=]|data\.(images|mask|points)=)")
+# Files outside `data.path`: another run, which may have another model by now, and files beside the data; and values
+# that are not in the text.
+OTHER_FILES = re.compile(r"\+*(init[.=]|data\.(images|mask|points)=)|.*\$\{")
 
 
 class FinishedJobs:

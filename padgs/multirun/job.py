@@ -205,4 +205,5 @@ def _message(error: Exception) -> str:
 
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:
     """Return whether the launcher runs jobs in other processes than its own."""
-    return not str(hydra.launcher._target_).endswith("BasicLauncher")
+    # joblib runs a single job at a time in its own process.
+    return not str(hydra.launcher._target_).endswith("BasicLauncher") and hydra.launcher.get("n_jobs") != 1

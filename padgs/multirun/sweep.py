@@ -30,13 +30,13 @@ from rich.console import Console
 from rich.table import Table
 
 from padgs import results
-from padgs.checks import printable, typed
-from padgs.multirun.finished import FinishedJobs
+from padgs.checks import printable, typed, unknown
+from padgs.multirun.finished import FinishedJobs, signature
 from padgs.multirun.job import Board, JobState, Status, complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
 from padgs.multirun.slurm import TOO_MANY, SubmissionRefused, wait_for_jobs
 from padgs.results import Result, ResultError
-from padgs.runs.config import RunOptions
+from padgs.runs.config import RETRIES, RunOptions
 from padgs.runs.console import Display, compact, duration, psnr_of, say, write
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import RETRIED
@@ -88,7 +88,11 @@ class Multirun:
         self.board = Board(Path(config.hydra.sweep.dir))
         self._in_process = not in_own_process(config.hydra)
         self._console, self._say, self._finished = console, partial(say, console), FinishedJobs(self.runs)
-        found = [self._finished.find(job) for job in jobs]
+        if config.retry not in RETRIES:
+            raise ValueError(unknown("retry", config.retry, RETRIES))
+        given = OmegaConf.select(config, "hydra.overrides.hydra") or ()
+        elsewhere = any("hydra.searchpath" in text for text in given)  # files that the index does not know
+        found = [None if elsewhere else self._finished.find(job) for job in jobs]
         if config.retry == "failed":
             found = [None if known and known[0] in RETRIED else known for known in found]
         self.before = Counter(known[0] for known in found if known)
@@ -205,6 +209,8 @@ class Multirun:
 
     def _end(self, index: int, state: JobState) -> None:
         self.states[index] = state
+        if state.data:
+            signature(state.data)  # as the data are now, not at the end of training; it is kept
         if state.status in Status.EXPLAINED and state.reason not in self._reasons:
             self._reasons.add(state.reason)  # once: a missing data set is missing for all rows of a table
             complain(state.reason)

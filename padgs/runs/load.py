@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,7 @@ class LoadedRun:
     result: Result | None  # None if the run is not finished
     iteration: int  # of the last checkpoint
     digest: str  # of the last checkpoint
+    opened_with: tuple[str, ...] = field(default=(), kw_only=True)  # options of the command line
 
     @property
     def files(self) -> RunStore:

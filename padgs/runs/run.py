@@ -39,6 +39,7 @@ MIN_THICKNESS = 0.01  # of all surfaces along their thinnest axis, relative to t
 MIN_ITERATIONS = 50  # a shorter run is not judged by its quality
 # Errors whose message suffices without a traceback. Failures of training are results; Failure is one of a later search.
 REPORTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)
+REPORTED += (MemoryError, torch.cuda.OutOfMemoryError)
 RETRIED = STATUSES.keys() - {"ok", "timeout"}  # statuses that retry=failed starts again
 
 
@@ -92,7 +93,7 @@ def run(
         result = _completed(config, scene, store, words)
         if result is None:
             method, progress = _prepared(config, scene, store, words)
-            saved_at, saved, interrupted = time.monotonic(), progress, False
+            saved_at, saved, interrupted, before = time.monotonic(), progress, False, progress
             with _Outcome(initial_result(config, scene, store.path.name), scene) as outcome:
                 with (
                     Interrupt(callback.stop_requested) as interrupt,
@@ -109,17 +110,17 @@ def run(
                         due = every is not None and record.iteration % every == 0
                         due = due or time.monotonic() - saved_at > config.run.checkpoint_seconds
                         if interrupted or ending or due:
-                            store.save(method, progress)
+                            store.save(method, _with_peak(progress, before, scene))
                             callback.saved(store.path)
                             saved_at, saved = time.monotonic(), progress
                         if interrupted:
                             break
                         line.update(record, probed)
                     if saved != progress:
-                        store.save(method, progress)
+                        store.save(method, _with_peak(progress, before, scene))
                     if interrupted or interrupt.requested:
                         raise Interrupted(f"stopped after iteration {progress.iteration}, the checkpoint is written")
-                outcome.result = replace(outcome.result, **_trained(method, scene, progress))
+                outcome.result = replace(outcome.result, **_trained(method, _with_peak(progress, before, scene)))
                 if scene.test:
                     outcome.result = scored(config, scene, store, outcome.result, method)
             result = store.finish(_final(config, outcome.result, progress))
@@ -255,7 +256,14 @@ def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, metho
     return probed.get("psnr")
 
 
-def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]:
+def _with_peak(progress: Progress, before: Progress, scene: Scene) -> Progress:
+    """Return progress with the peak memory of training in this process, and in those `before`."""
+    now = clock.peak_memory(scene.points.device)
+    peaks = {of: max(filter(None, (peak, getattr(before, of))), default=None) for of, peak in now.items()}
+    return replace(progress, **peaks)
+
+
+def _trained(method: Method, progress: Progress) -> dict[str, Any]:
     size = method.size()
     initial = {"start": method.start} if "gaussians" in size.counts else {}
     return {
@@ -265,7 +273,9 @@ def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]
         "model_bytes": size.bytes,
         "ended": method.ended,
         "timing": {"train_seconds": progress.seconds, "cpu_seconds": progress.cpu_seconds},
-        **clock.peak_memory(scene.points.device),  # of training: scoring has networks of its own
+        # Of training: scoring has networks of its own.
+        "peak_memory_bytes": progress.peak_memory_bytes,
+        "peak_device_memory_bytes": progress.peak_device_memory_bytes,
     }
 
 
@@ -298,8 +308,8 @@ def _is_retried(config: RunConfig, result: Result) -> bool:
 
 
 def _unscored(config: RunConfig, scene: Scene, result: Result) -> dict[str, Protocol]:
-    """Return the protocols under whose rules a run that ended well has no scores of its test views, if any."""
-    asked = config.protocols.items() if result.ok and scene.test else ()
+    """Return the protocols under whose rules a run that did not fail has no scores of its test views, if any."""
+    asked = config.protocols.items() if result.status not in RETRIED and scene.test else ()
     known = {name: scores.protocol for name, scores in result.scores.items()}
     return {name: rules for name, rules in asked if name not in known or not _covers(known[name], _stored(rules))}
 

@@ -85,7 +85,9 @@ class Search:
         if not result.smallest:
             loaded = self._load(folder / result.run)
             measured = self._measured(loaded)
-            measured["seconds"], measured["cpu_seconds"] = lap.seconds()
+            # Training may have been interrupted, and this process is then only the last of several.
+            spent = zip(lap.seconds(), (result.timing[f"{of}_seconds"] for of in ("train", "cpu")), strict=True)
+            measured["seconds"], measured["cpu_seconds"] = map(max, spent)
             with loaded.files:
                 result = loaded.files.finish(replace(result, smallest=measured))
         return candidates.Candidate(**result.smallest, scores=result.scores[RULES.name])
@@ -170,6 +172,7 @@ class Search:
             run=replace(config.run, folder=folder, pictures=False),
             protocols={RULES.name: RULES},
             labels=Labels(self._result.preset),
+            retry="failed",
         )
 
     def _trained(self, config: RunConfig, stop_requested: Callable[[], bool]) -> Result:
@@ -179,7 +182,8 @@ class Search:
         callback.is_candidate = True
         result = run(config, Console(quiet=True), callback, self.run.scene)
         if not result.ok:
-            raise ValueError(f"{config.run.folder}/{result.run} ended with status {result.status} ({result.reason})")
+            failed = f"{config.run.folder}/{result.run} ended with status {result.status} ({result.reason})"
+            raise ValueError(f"{failed}; padgs smallest {self.run.folder} tries it again")
         return result
 
     @torch.no_grad()

@@ -62,6 +62,8 @@ class Progress:
     seconds: float = 0.0  # training time
     cpu_seconds: float = 0.0
     share: float = 0.0  # of the schedule
+    peak_memory_bytes: int = 0  # of all processes that trained; see `Result`
+    peak_device_memory_bytes: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse what a forged checkpoint may hold."""

@@ -112,7 +112,7 @@ class Tracker:
     def _add(self, run: Path, result: Result) -> None:
         from mlflow.entities import Metric, Param
 
-        mark = f"{result.run} {result.finished}"  # of copies and renamed folders, too
+        mark = f"{result.run} {results.encoded(result)['sha256']}"  # of copies and renamed folders, too
         if self._find(FINISHED, mark):
             return
         words = {"status": result.status, "preset": result.preset, "scene": result.scene, "variant": result.variant}

@@ -137,7 +137,8 @@ def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, cap
     assert f"padgs-run data.path={source} init={path} train.refine=true" in capsys.readouterr().out
     merged, loaded = padgs.load_run(path, device="cpu"), [padgs.load_run(one, device="cpu") for one in runs]
     assert merged.result.ok and merged.result.variant == "2 blocks, continued"
-    assert merged.config.data.path == str(source)
+    assert merged.config.data.path == str(source) and path.parent == loaded[0].folder.parent
+    assert merged.result.preset == loaded[0].result.preset
     assert len(merged.scene.test) == 4 and merged.score("sphere").metrics == merged.scores["sphere"].metrics
     assert merged.result.timing["cpu_seconds"] == sum(one.result.timing["cpu_seconds"] for one in loaded)
     means = merged.method.model.splats.means

@@ -28,7 +28,10 @@ def test_settings_without_effect_on_results_are_ignored(runs):
         assert FinishedJobs(runs).find([extra, *reversed(JOB)]) == ("ok", "room_padgs_1")
 
 
-@pytest.mark.parametrize("setting", ["init=runs/other", "++data.images=/a", "data.mask=/a.png", "data.points=/a.ply"])
+@pytest.mark.parametrize(
+    "setting",
+    ["init=runs/other", "++data.images=/a", "data.mask=/a.png", "data.points=/a.ply", "data.path=${oc.env:A}"],
+)
 def test_a_job_that_reads_other_files_than_those_of_its_data_is_looked_up(runs, setting):
     job = [setting, *JOB]
     FinishedJobs(runs).add(job, "room_padgs_1", "ok", None)

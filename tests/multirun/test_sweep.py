@@ -14,7 +14,7 @@ from support import made_up
 
 from padgs import results
 from padgs.multirun import slurm, sweep
-from padgs.multirun.job import Board, JobState
+from padgs.multirun.job import Board, JobState, in_own_process
 from padgs.multirun.slurm import SubmissionRefused
 from padgs.multirun.sweep import Multirun
 from padgs.runs.interrupt import Interrupted
@@ -27,7 +27,7 @@ JOBS = [["++seed=0"], ["++seed=1"], ["++seed=2"]]
 class Start:
     """One start of the same sweep, and how often each of its jobs was launched."""
 
-    def __init__(self, tmp_path, number: int, target: str, retry: str = "none", jobs=JOBS):
+    def __init__(self, tmp_path, number: int, target: str, retry: str = "none", jobs=JOBS, given=()):
         self.runs, self.out = tmp_path / "runs", io.StringIO()
         self.folder = self.runs / ".multirun" / str(number)
         config = {
@@ -38,6 +38,7 @@ class Start:
                 "sweep": {"dir": str(self.folder)},
                 "launcher": {"_target_": target},
                 "runtime": {"choices": {"experiment": "test"}},
+                "overrides": {"hydra": [*given]},
             },
         }
         self.multirun = Multirun(OmegaConf.create(config), jobs, Console(file=self.out, width=200))
@@ -92,6 +93,23 @@ def test_each_run_has_a_line_that_says_what_differs_and_the_end_a_table_and_a_co
     again = Scored(tmp_path, 2, target)
     again.counts()
     assert again.out.getvalue().endswith(end), "finished before"
+
+
+def test_jobs_with_configuration_files_from_elsewhere_are_looked_up(tmp_path):
+    Start(tmp_path, 1, ELSEWHERE).counts()
+    again = Start(tmp_path, 2, ELSEWHERE, given=["hydra.searchpath=[file:///mine]"])
+    assert again.counts() == {"ok": 3} and len(again.launched) == 3
+
+
+def test_an_unknown_choice_of_what_to_retry_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="unknown retry 'fail'; known: none, failed"):
+        Start(tmp_path, 1, ELSEWHERE, retry="fail")
+
+
+def test_one_job_at_a_time_runs_in_this_process():
+    of = {"launcher": {"_target_": ELSEWHERE}}
+    ours = [in_own_process(OmegaConf.merge(of, {"launcher": {"n_jobs": count}})) for count in (1, 2)]
+    assert ours == [False, True] and in_own_process(OmegaConf.create(of))
 
 
 def test_only_missing_jobs_are_launched(tmp_path):

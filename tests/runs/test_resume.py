@@ -9,6 +9,7 @@ import torch
 from support.composed import composed
 from support.training import ITERATIONS, SMALL, folder_of, run, stop_at
 
+from padgs import clock
 from padgs.data.capture import DataError
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.runs import checkpoint
@@ -29,6 +30,18 @@ def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config
     assert "resuming after iteration 8" in said
     assert resumed.scores == undisturbed.scores
     same_checkpoint(config, replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
+
+
+def test_peak_memory_is_that_of_all_processes_that_trained(config, monkeypatch):
+    peaks = {"peak_memory_bytes": 9, "peak_device_memory_bytes": None}
+    monkeypatch.setattr(clock, "peak_memory", lambda device: dict(peaks))
+    with monkeypatch.context() as patch:
+        stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(Interrupted):
+            run(config)
+    peaks |= {"peak_memory_bytes": 5, "peak_device_memory_bytes": 3}
+    result, _ = run(config)
+    assert (result.peak_memory_bytes, result.peak_device_memory_bytes) == (9, 3)
 
 
 def test_ctrl_c_in_the_last_iteration_scores_at_the_next_start(config, monkeypatch):

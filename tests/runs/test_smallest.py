@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import padgs
 from padgs.checks import ConfigError
 from padgs.cli.commands import app
+from padgs.methods.anchors.method import PaDGSMethod
 from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.results import SMALLEST_LOSSES, Scores
@@ -231,6 +232,22 @@ def test_a_search_writes_what_it_found_and_keeps_the_smallest_model_as_a_run(loa
     again = find_smallest(load(f"method={method}"), 0.1, Console(quiet=True)).smallest
     assert again["steps"] == found["steps"] and again["kept"]["epsilon"] == 0.1, "candidates are not trained again"
     assert [path.stat().st_mtime_ns for path in candidates] == written
+
+
+def test_a_candidate_that_failed_is_tried_again(load, monkeypatch):
+    fit = PaDGSMethod.fit
+    with monkeypatch.context() as patch:
+        patch.setattr(PaDGSMethod, "fit", lambda *_: failing())
+        with pytest.raises(ValueError, match=r"ended with status oom .*; padgs smallest .* tries it again"):
+            Search(load("method=padgs"), Console(quiet=True)).complete()
+    assert PaDGSMethod.fit is fit
+    again = Search(load("method=padgs"), Console(quiet=True))
+    again.complete()
+    assert again.candidates
+
+
+def failing():
+    raise MemoryError("for the test")
 
 
 def test_an_interrupted_search_resumes_to_the_same_candidates(load):

@@ -92,6 +92,10 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_and_pictures(tmp_path
     tracker.add(bad)  # it was started again: the failed attempt stays
     again = client.search_runs([experiment.experiment_id], "tags.`padgs.run` = 'room_padgs_2'")
     assert sorted(run.info.status for run in again) == ["FAILED", "FINISHED"]
+    scored = replace(results.read(good / "result.json"), experiments=("tau", "table1"))
+    results.write(scored, good)
+    tracker.add(good)  # with something new, although it ended at the same time
+    assert len(client.search_runs([experiment.experiment_id], "tags.`padgs.run` = 'room_padgs_1'")) == 2
     (runs / "mlflow.db").write_text("no database any more")
     results.write(replace(results.read(good / "result.json"), finished="later"), good)
     tracker.add(good)

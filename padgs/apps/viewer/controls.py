@@ -87,15 +87,15 @@ class FilmControls:
     """Keyframes of a camera path, saved as a file that `padgs render --path` reads."""
 
     def __init__(
-        self, client: Any, folder: Path, model: Path, origin: Tensor, pose: Callable[[], Tensor], may_write: bool
+        self, client: Any, folder: Path, command: str, origin: Tensor, pose: Callable[[], Tensor], may_write: bool
     ) -> None:
         """Add the controls to a `viser.ClientHandle`.
 
-        `folder` is that of the run or beside a file, `model` the run or file as `padgs render` opens it. Paths are
+        `folder` is that of the run or beside a file, `command` the `padgs render` that opens the model. Paths are
         stored in the world of the data set, where the scene has its `origin`; `pose` returns the current
         cam_from_world. `may_write`: save beside the run; else the browser downloads the file.
         """
-        self._client, self._folder, self._model, self._origin, self._pose = client, folder, model, origin, pose
+        self._client, self._folder, self._command, self._origin, self._pose = client, folder, command, origin, pose
         self._may_write, self.keyframes = may_write, list[Tensor]()
         with client.gui.add_folder("film", expand_by_default=False):
             client.gui.add_button("add view").on_click(lambda _: self.change(self.keyframes.append, self._pose()))
@@ -128,4 +128,4 @@ class FilmControls:
         except OSError as error:
             self.words.content = f"cannot write {file}: {error.strerror or error}"
             return
-        self.words.content = f"saved. `padgs render {shlex.quote(str(self._model))} --path {shlex.quote(str(file))}`"
+        self.words.content = f"saved. `{self._command} --path {shlex.quote(str(file))}`"

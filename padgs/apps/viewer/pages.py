@@ -1,5 +1,6 @@
 """Pages of the viewer: controls and a render thread for each browser, and updates from training."""
 
+import shlex
 import threading
 import time
 import warnings
@@ -97,7 +98,8 @@ class Page:
         self._up = torch.tensor(gravity(poses).up, dtype=torch.float64)
         model = getattr(renderers[0].run, "file", folder)  # as commands name it
         self._crop = CropControls(client, box, model, can_crop, self.redraw)
-        self._film = FilmControls(client, folder, model, scene.origin, lambda: self.state().cam_from_world, may_stop)
+        command = shlex.join(["padgs", "render", str(model), *renderers[0].run.opened_with])
+        self._film = FilmControls(client, folder, command, scene.origin, lambda: self.state().cam_from_world, may_stop)
         self._frusta = [self._frustum(view) for view in self._views.values()]
         for control in (self._camera, self._layer, self._gain, self._run, self._fov, self._width, self._level):
             control.on_update(self.redraw)

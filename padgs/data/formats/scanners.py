@@ -68,8 +68,7 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
     if not files:
         raise DataError(f"{path} holds no .e57 file")
     if options.images is not None:
-        rule = "an E57 file holds its images: edit those written beside it"
-        raise DataError(f"data.images={options.images}: {rule}, or convert it and name another folder then")
+        raise DataError(f"data.images={options.images}: E57 files hold their images; edit those written beside them")
     root, named = path.parent if path.is_file() else path, listed(file.name for file in files)
     frames: list[Frame] = []
     others: list[str] = []

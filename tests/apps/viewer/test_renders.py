@@ -98,11 +98,12 @@ def test_saved_films_are_paths_in_the_world_of_the_data(tmp_path):
     client, origin = MagicMock(), torch.tensor([100.0, 0.0, 0.0], dtype=torch.float64)
     poses = [torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)]
     poses[1][:3, 3] = torch.tensor([0.0, 0.0, 1.0])
-    film = FilmControls(client, tmp_path, tmp_path, origin, lambda: poses[0], True)
+    film = FilmControls(client, tmp_path, "padgs render a.ply --data D", origin, lambda: poses[0], True)
     film.save()
     assert "at least two" in film.words.content and not [*tmp_path.iterdir()]
     film.keyframes.extend(poses)
     film.save(), film.save()
     assert {file.name for file in tmp_path.iterdir()} == {"film.json", "film-2.json"}
+    assert film.words.content == f"saved. `padgs render a.ply --data D --path {tmp_path / 'film-2.json'}`"
     found = move_origin(read_path(tmp_path / "film.json", 2, (0, 0, 1)), origin)
     assert torch.allclose(found, torch.stack(poses))

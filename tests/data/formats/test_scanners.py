@@ -17,7 +17,7 @@ from support.fixtures import PANORAMA, World, quaternion, write_images, write_na
 
 from padgs.data import DataError, load, read
 from padgs.data import scans as scans_module
-from padgs.data.capture import Cloud
+from padgs.data.capture import Cloud, DataOptions
 from padgs.data.cloud import joined, read_cloud, write_ply
 from padgs.data.formats.scanners import _named_images
 
@@ -237,6 +237,11 @@ def test_e57_files_hold_panoramas_poses_and_points(e57: Path, world: World) -> N
             assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[i]))  # type: ignore[misc]
         torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float(), atol=1e-6, rtol=0)
         assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
+
+
+def test_another_image_folder_beside_an_e57_file_is_refused(e57: Path) -> None:
+    with pytest.raises(DataError, match="data.images=edited: E57 files hold their images; edit those written beside"):
+        read(e57, options=DataOptions(images="edited"))
 
 
 def test_suffixes_are_found_in_any_case_and_hidden_files_are_not_read(e57: Path) -> None:
