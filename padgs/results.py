@@ -74,7 +74,7 @@ class Result:
     timing: dict[str, float] = field(default_factory=dict)  # train_seconds, cpu_seconds, render_ms_{min,median}
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
     model_bytes: int = 0
-    peak_memory_bytes: int = 0  # of the process, while training
+    peak_memory_bytes: int = 0  # of all processes that trained
     peak_device_memory_bytes: int | None = None  # of torch's tensors on the GPU, while training; None on the CPU
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
     experiments: tuple[str, ...] = ()  # experiments and sweeps of the run, sorted; see `joined`

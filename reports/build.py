@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from pandas import DataFrame
+from pandas import DataFrame, Series
 
 from padgs.reports import REPORTS, frame, methods, published
 from padgs.reports.conditions import Reason, as_published, footnotes, refuse_mixture, unranked, unranked_notes
@@ -14,7 +14,7 @@ from padgs.reports.frame import by_conditions, by_place, grouped, law, without_d
 from padgs.reports.measures import Measure, quantity
 from padgs.reports.published import AVERAGE, Place, Published
 from padgs.reports.selection import Mixture, RunSet, experiment_of, one_setting, refuse_differences, settings
-from padgs.reports.significance import SEEDS, mean_cell, numbers_of, over_scenes, over_seeds, places, unrank
+from padgs.reports.significance import is_few, mean_cell, numbers_of, over_scenes, over_seeds, places, unrank
 from padgs.reports.specs import PREPARE, SPECS, TITLES
 from padgs.reports.table import Block, Cell, Column, Row, Table
 
@@ -150,7 +150,7 @@ class _Builder:
                 found.append(Column(PAPER_COLUMNS[0], decimals, ours.higher_is_better, group=ours.group, optional=True))
                 if measure.difference:
                     found.append(Column(PAPER_COLUMNS[1], ours.decimals, signed=True, group=ours.group, optional=True))
-            if self.spec.difference and _is_psnr(measure):
+            if self.spec.difference and measure.column.group == "PSNR":
                 found.append(Column("Δ", 2, signed=True))
         return tuple(found)
 
@@ -178,7 +178,7 @@ class _Builder:
                     row.append(_published(theirs[value].get(measure.published)))
                     if measure.difference:
                         row.append(_difference(cell, row[-1]) if comparable else Cell())
-                if self.spec.difference and _is_psnr(measure):
+                if self.spec.difference and measure.column.group == "PSNR":
                     row.append(Cell(_by_seed(of[value], next(iter(of.values())), measure).value))
             rows.append(Row(titles[value], tuple(row)))
         return tuple(rows)
@@ -240,7 +240,7 @@ class _Builder:
         sign = -1.0 if self.measures[0].column.higher_is_better else 1.0
         found.sort(key=lambda row: (row[1][0].value is None, sign * (row[1][0].value or 0.0)))
         cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
-        separable = all(cell.count >= SEEDS for cell in cells.values())
+        separable = not any(map(is_few, cells.values()))
         shared = places(cells, self.measures[0].column) if separable else []
         ranks = {i: Cell(1 + sum(map(len, shared[:place]))) for place, rows in enumerate(shared) for i in rows}
         return tuple(Row(title, (ranks.get(i, Cell()), *row)) for i, (title, row) in enumerate(found))
@@ -315,10 +315,6 @@ class _Pivot(_Builder):
         return [Block(title, tuple(rows))]
 
 
-def _is_psnr(measure: Measure) -> bool:
-    return measure.column.group == "PSNR"
-
-
 def _published(number: Published | None) -> Cell:
     if number is None or number.status == "missing":
         return Cell()
@@ -327,7 +323,7 @@ def _published(number: Published | None) -> Cell:
 
 def _by_seed(ours: DataFrame, theirs: DataFrame, measure: Measure) -> Cell:
     """Return the mean difference of the runs of two settings with the same seeds, failed runs left out."""
-    first, second = (of.loc[of["ok"]].set_index("seed")[measure.name].astype(float) for of in (ours, theirs))
+    first, second = (Series(numbers_of(of, [measure])[:, 0], of["seed"]) for of in (ours, theirs))
     return mean_cell((first - second).dropna().tolist())
 
 

@@ -209,10 +209,8 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
     ours, others = claim.sides
     shared = ("place", "resolution", "length", "data", *(("machine",) if claim.metric in COSTS else ()))
     best: dict[tuple[str, ...], dict[str, Any]] = {}
-    for values, alike in grouped(runs, *shared) if len(runs) else ():
-        found = dict(zip(shared, values, strict=True))
-        size, length = found["resolution"], found["length"]
-        where = f"{claim.text}, {found['place'].scene}, {size}, {length}"
+    for (place, size, length, *_), alike in grouped(runs, *shared) if len(runs) else ():
+        where = f"{claim.text}, {place.scene}, {size}, {length}"
         refuse_mixture(alike, run_set.request, where, ("protocol",))
         try:
             own = one_setting(ours.select(alike), where)
@@ -220,7 +218,6 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             raise ReportError(str(mixture)) from mixture
         if row := _beside_best(claim, own, others.select(alike), where):
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
-            place = found["place"]
             row |= {"place": place, "scene": place.label, "seen": place.seen, "size": size, "length": length}
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)

@@ -292,13 +292,13 @@ NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "rate_factor": _factor,
     "train_seconds": _training_seconds,
     "wall_seconds": lambda result: result.timing.get("train_seconds"),
-    "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of the process, while training
+    "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of the processes that trained
     "frame_ms": lambda result: result.timing.get("render_ms_median"),  # of repeats, decoding included
     "anchors": lambda result: result.counts.get("anchors"),
     "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before training
     "gaussians": lambda result: result.counts.get("gaussians"),
     "minimal_count": lambda result: _minimal_count(result.smallest),
     "megabytes": lambda result: result.model_bytes / 1e6 or None,
-    "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training
+    "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the processes that trained
     "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there
 }

@@ -94,8 +94,8 @@ def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int,
     column, every = columns[index], ((i, row.cells[index]) for i, row in enumerate(block.rows))
     cells = {i: cell for i, cell in every if cell.value is not None and cell.ranked}
     sign = -1.0 if column.higher_is_better else 1.0
-    few = min((sign * (cell.value or 0.0) for cell in cells.values() if _few(cell)), default=math.inf)
-    shared = places({i: cell for i, cell in cells.items() if not _few(cell)}, column)
+    few = min((sign * (cell.value or 0.0) for cell in cells.values() if is_few(cell)), default=math.inf)
+    shared = places({i: cell for i, cell in cells.items() if not is_few(cell)}, column)
     found: dict[int, str] = {}
     for rank, rows in zip((BEST, SECOND), shared if len(shared) > 1 else (), strict=False):
         numbers = [sign * (cells[i].value or 0.0) for i in rows]
@@ -105,7 +105,7 @@ def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int,
     return found
 
 
-def _few(cell: Cell) -> bool:
+def is_few(cell: Cell) -> bool:
     """Return whether a cell has too few seeds for a mark, or failed runs, without which its mean is too good."""
     return cell.count < SEEDS or bool(cell.status)
 

@@ -31,6 +31,7 @@ def view(
 
     check_range(1, 65535, port=port)
     folders = (run, beside) if beside else (run,)
+    opened: list[LoadedRun] = []
 
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.external import is_splat_file, open_model
@@ -45,8 +46,8 @@ def view(
             for note in getattr(runs[-1], "notes", ()):
                 show(f"  {note}")
         if len(names := [*dict.fromkeys(found.scene.name for found in runs)]) > 1:
-            scenes = " and ".join(names)
-            raise ValueError(f"{run} and {beside} are of two scenes, {scenes}; name two runs of one scene")
+            raise ValueError(f"{run} and {beside} are of two scenes, {' and '.join(names)}; name two runs of one scene")
+        opened[:] = runs
         return runs
 
     if not all(Path(folder).is_file() or (Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
@@ -54,8 +55,6 @@ def view(
     try:
         serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
     except KeyboardInterrupt:  # the way to end it
-        from padgs.apps.external import options_of
-
-        command = shlex.join(["padgs", "render", run, *options_of(data, rays, transform)])
+        command = shlex.join(["padgs", "render", run, *(opened[0].opened_with if opened else ())])
         show(f"next: {command}  (--path film.json after saving a film)")
         raise

@@ -138,25 +138,25 @@ def _every(names: Names, every: int, mode: str) -> Split:
 
 def _resolve(lines: Names, names: Names, which: str, unposed: Names, left_out: Names) -> set[int]:
     meant: dict[str, set[int]] = {}
-    for i, name in enumerate(names):
+    known = (*names, *left_out)
+    for i, name in enumerate(known):
         for key in spellings(name):
             meant.setdefault(key, set()).add(i)
-    meant |= {normalize("NFC", name): {i} for i, name in enumerate(names)}
+    meant |= {normalize("NFC", name): {i} for i, name in enumerate(known)}
     chosen: set[int] = set()
     absent: list[str] = []
     for line in lines:
         found = next((meant[key] for key in spellings(line) if key in meant), set())
         if len(found) > 1:
-            matches = listed(names[i] for i in sorted(found))
+            matches = listed(known[i] for i in sorted(found))
             raise DataError(f"the {which} names {line!r}, which matches {matches}; be specific")
         if not found:
             absent.append(line)
         chosen |= found
-    there, ignored = ({key for name in some for key in spellings(name)} for some in (unposed, left_out))
-    absent = [line for line in absent if not ignored & set(spellings(line))]
+    there = {key for name in unposed for key in spellings(name)}
     if without := [line for line in absent if there & set(spellings(line))]:
         raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
     if absent:
         rule = f"a line is one name, and the data set has {listed(names)}"
         raise DataError(f"the {which} names images that do not exist: {listed(map(repr, absent))}; {rule}")
-    return chosen
+    return {i for i in chosen if i < len(names)}

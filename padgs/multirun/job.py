@@ -24,6 +24,7 @@ from rich.console import Console
 
 from padgs.checks import unknown
 from padgs.multirun.composition import typed_config
+from padgs.multirun.finished import signature
 from padgs.results import SMALLEST_STATED, Result
 from padgs.runs.config import RunConfig
 from padgs.runs.console import say
@@ -32,6 +33,7 @@ from padgs.runs.load import load_run
 from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
 from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy
+from padgs.training.health import is_out_of_memory, memory_reason
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
 SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`
@@ -148,6 +150,8 @@ def job_of_many(composed: DictConfig) -> str:
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
+            if entry.data and not alone:
+                signature(entry.data)  # kept: what is stored at the end is of the data before training
             scene = load_scene(config, start(config))
             result = run(config, console, entry, scene, brief=not alone)
             search_smallest(config, scene, result, console, entry)
@@ -157,9 +161,9 @@ def job_of_many(composed: DictConfig) -> str:
             if alone:
                 return Status.STOPPED
             raise
-        except EXPECTED as error:
-            return entry.end(Status.ELSEWHERE if isinstance(error, RunBusy) else Status.REFUSED, str(error))
         except Exception as error:
+            if isinstance(error, EXPECTED) or is_out_of_memory(error):
+                return entry.end(Status.ELSEWHERE if isinstance(error, RunBusy) else Status.REFUSED, _message(error))
             say(console, traceback.format_exc())
             return entry.end(Status.CRASHED, f"{type(error).__name__}: {error}")
 
@@ -185,7 +189,9 @@ def exit_on_errors() -> Iterator[None]:
         yield
     except BrokenPipeError:  # the reader of the output has ended
         raise
-    except (HydraException, *EXPECTED) as error:
+    except Exception as error:
+        if not (isinstance(error, (HydraException, *EXPECTED)) or is_out_of_memory(error)):
+            raise
         complain(_message(error))
         sys.exit(1)
 
@@ -200,6 +206,8 @@ def _message(error: Exception) -> str:
         return f"{key}={value} cannot be read: {rule}, e.g. padgs-run '{key}=\"VALUE\"'"
     if several := re.match("Ambiguous value for argument '(?:\\+\\+)?(.*)'\n", str(error)):
         return f"{several[1]} has several values; give -m for one run each"
+    if not isinstance(error, EXPECTED) and is_out_of_memory(error):
+        return f"out of memory: {memory_reason(error)}"
     return f"{error}\n{error.__cause__}" if isinstance(error, HydraException) and error.__cause__ else str(error)
 
 

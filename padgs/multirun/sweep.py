@@ -90,8 +90,8 @@ class Multirun:
         self._console, self._say, self._finished = console, partial(say, console), FinishedJobs(self.runs)
         if config.retry not in RETRIES:
             raise ValueError(unknown("retry", config.retry, RETRIES))
-        given = OmegaConf.select(config, "hydra.overrides.hydra") or ()
-        elsewhere = any("hydra.searchpath" in text for text in given)  # files that the index does not know
+        # Configuration files from elsewhere are not known to the index.
+        elsewhere = "hydra.searchpath" in str(OmegaConf.select(config, "hydra.overrides.hydra"))
         found = [None if elsewhere else self._finished.find(job) for job in jobs]
         if config.retry == "failed":
             found = [None if known and known[0] in RETRIED else known for known in found]
@@ -210,7 +210,7 @@ class Multirun:
     def _end(self, index: int, state: JobState) -> None:
         self.states[index] = state
         if state.data:
-            signature(state.data)  # as the data are now, not at the end of training; it is kept
+            signature(state.data)  # kept: what is stored at the end is of the data before training
         if state.status in Status.EXPLAINED and state.reason not in self._reasons:
             self._reasons.add(state.reason)  # once: a missing data set is missing for all rows of a table
             complain(state.reason)

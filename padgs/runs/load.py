@@ -99,6 +99,7 @@ class LoadedRun:
         if checkpoint.digest(self.files.checkpoint) == self.digest and self.files.result() == self.result:
             return None
         run = load_run(self.folder, data_path=self.config.data.path, device=self.config.run.device)
+        run.opened_with = self.opened_with
         if "scene" in self.__dict__:  # loaded already
             run.scene = self.scene
         return run

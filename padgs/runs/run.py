@@ -39,7 +39,6 @@ MIN_THICKNESS = 0.01  # of all surfaces along their thinnest axis, relative to t
 MIN_ITERATIONS = 50  # a shorter run is not judged by its quality
 # Errors whose message suffices without a traceback. Failures of training are results; Failure is one of a later search.
 REPORTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)
-REPORTED += (MemoryError, torch.cuda.OutOfMemoryError)
 RETRIED = STATUSES.keys() - {"ok", "timeout"}  # statuses that retry=failed starts again
 
 
@@ -94,7 +93,7 @@ def run(
         if result is None:
             method, progress = _prepared(config, scene, store, words)
             saved_at, saved, interrupted, before = time.monotonic(), progress, False, progress
-            with _Outcome(initial_result(config, scene, store.path.name), scene) as outcome:
+            with _Outcome(initial_result(config, scene, store.path.name), scene, before) as outcome:
                 with (
                     Interrupt(callback.stop_requested) as interrupt,
                     Interrupt(store.stop.exists, STOP_SIGNALS) as stop,
@@ -110,17 +109,17 @@ def run(
                         due = every is not None and record.iteration % every == 0
                         due = due or time.monotonic() - saved_at > config.run.checkpoint_seconds
                         if interrupted or ending or due:
-                            store.save(method, _with_peak(progress, before, scene))
+                            store.save(method, replace(progress, **_peaks(before, scene)))
                             callback.saved(store.path)
                             saved_at, saved = time.monotonic(), progress
                         if interrupted:
                             break
                         line.update(record, probed)
                     if saved != progress:
-                        store.save(method, _with_peak(progress, before, scene))
+                        store.save(method, replace(progress, **_peaks(before, scene)))
                     if interrupted or interrupt.requested:
                         raise Interrupted(f"stopped after iteration {progress.iteration}, the checkpoint is written")
-                outcome.result = replace(outcome.result, **_trained(method, _with_peak(progress, before, scene)))
+                outcome.result = replace(outcome.result, **_trained(method, progress), **_peaks(before, scene))
                 if scene.test:
                     outcome.result = scored(config, scene, store, outcome.result, method)
             result = store.finish(_final(config, outcome.result, progress))
@@ -131,8 +130,8 @@ def run(
 class _Outcome:
     """Context that turns failures of training into the status of `result`, but no interrupt and no unreadable image."""
 
-    def __init__(self, result: Result, scene: Scene) -> None:
-        self.result, self._scene = result, scene
+    def __init__(self, result: Result, scene: Scene, before: Progress) -> None:
+        self.result, self._scene, self._before = result, scene, before
 
     def __enter__(self) -> _Outcome:
         return self
@@ -150,7 +149,7 @@ class _Outcome:
             status, reason = "oom", f"out of memory: {memory_reason(error)}"
         else:
             return False
-        self.result = replace(self.result, status=status, reason=reason, **clock.peak_memory(self._scene.points.device))
+        self.result = replace(self.result, status=status, reason=reason, **_peaks(self._before, self._scene))
         return True
 
 
@@ -256,11 +255,10 @@ def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, metho
     return probed.get("psnr")
 
 
-def _with_peak(progress: Progress, before: Progress, scene: Scene) -> Progress:
-    """Return progress with the peak memory of training in this process, and in those `before`."""
+def _peaks(before: Progress, scene: Scene) -> dict[str, Any]:
+    """Return the peak memory of training in this process and in those `before`; scoring has networks of its own."""
     now = clock.peak_memory(scene.points.device)
-    peaks = {of: max(filter(None, (peak, getattr(before, of))), default=None) for of, peak in now.items()}
-    return replace(progress, **peaks)
+    return {of: max(filter(None, (peak, getattr(before, of))), default=None) for of, peak in now.items()}
 
 
 def _trained(method: Method, progress: Progress) -> dict[str, Any]:
@@ -273,9 +271,6 @@ def _trained(method: Method, progress: Progress) -> dict[str, Any]:
         "model_bytes": size.bytes,
         "ended": method.ended,
         "timing": {"train_seconds": progress.seconds, "cpu_seconds": progress.cpu_seconds},
-        # Of training: scoring has networks of its own.
-        "peak_memory_bytes": progress.peak_memory_bytes,
-        "peak_device_memory_bytes": progress.peak_device_memory_bytes,
     }
 
 

@@ -25,7 +25,7 @@ FEWER = 0.01  # share of the initial Gaussians or anchors
 FLATTER = 0.01  # share of the variance of the image
 FAINTEST = 0.05  # mean opacity where the photograph counts and is not black
 MORE = 10  # times the initial number of Gaussians or anchors, or the pixels of all training views
-ADVICE = "with train.monitor=false retry=failed it starts again, and is not ended"
+ADVICE = "to train it to its end all the same, start it again with train.monitor=false retry=failed"
 
 VALIDATION_SHARE, MIN_VALIDATION = 8, 3  # one of so many training views is held out, and at least so many are
 FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes through

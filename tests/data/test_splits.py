@@ -58,6 +58,15 @@ def test_the_split_of_the_format_takes_precedence(tmp_path: Path) -> None:
     assert split_frames(NAMES, tmp_path, stated=stated, mode="files").train == (0,)
 
 
+def test_lists_may_name_what_is_left_out_which_stands_for_no_other_image(tmp_path: Path) -> None:
+    names, left_out = ["panos/1.jpg", "panos/2.jpg", "panos/3.jpg"], ["photos/1.jpg"]
+    folder = _lists(tmp_path, "panos/1.jpg\npanos/3", "photos/1.jpg\n2.jpg")
+    split = split_frames(names, folder, left_out=left_out)
+    assert (split.train, split.test) == ((0, 2), (1,))
+    with pytest.raises(DataError, match="names '1.jpg', which matches panos/1.jpg, photos/1.jpg; be specific"):
+        split_frames(names, _lists(tmp_path, "1.jpg", "2.jpg"), left_out=left_out)
+
+
 def test_unused_views_are_reported(tmp_path: Path) -> None:
     assert "3 posed views are in neither list and are not used" in split_frames(NAMES, _lists(tmp_path, "a", "b")).notes
 

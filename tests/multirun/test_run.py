@@ -166,3 +166,18 @@ def test_expected_errors_are_reported_without_a_traceback(capsys, error):
     with pytest.raises(SystemExit, match="1"), exit_on_errors():
         raise error
     assert capsys.readouterr().err == f"error: {error}\n"
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")]
+)
+def test_a_lack_of_memory_is_reported_with_a_way_out(capsys, error):
+    with pytest.raises(SystemExit, match="1"), exit_on_errors():
+        raise error
+    said = capsys.readouterr().err
+    assert said.startswith("error: out of memory: ") and "data.width" in " ".join(said.split())
+
+
+def test_other_errors_keep_their_traceback():
+    with pytest.raises(RuntimeError, match="a fault"), exit_on_errors():
+        raise RuntimeError("a fault")

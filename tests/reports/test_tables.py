@@ -296,6 +296,19 @@ def test_a_difference_is_of_the_seeds_that_both_rows_have():
     assert value(table, "PaD-GS", "distance in world units", "Δ") == pytest.approx(-1.0)
 
 
+def test_a_difference_from_runs_that_all_failed_is_missing():
+    made = [replace(one, status="oom", scores={}) for one in deviating(padgs=25.0, padgs_distance=24.0)]
+    table = deviations(run_set(made))
+    assert value(table, "PaD-GS", "distance in world units", "Δ") is None
+
+
+def test_a_method_that_failed_on_a_seed_has_no_rank_beside_others():
+    lost = of_experiment("order@cpu", 30.0, preset="omnigs", seed=3)
+    made = [*ordered(), replace(lost, status="oom", scores={})]
+    (block,) = order(run_set(made)).blocks
+    assert {row.cells[0].value for row in block.rows} == {None}
+
+
 def test_the_best_stands_first_by_a_metric_that_falls():
     (block,) = order(run_set(ordered(), metrics=("lpips_vgg_01",))).blocks
     assert [row.cells[0].value for row in block.rows] == [1, 2, 2, 4]

@@ -40,8 +40,17 @@ def test_peak_memory_is_that_of_all_processes_that_trained(config, monkeypatch):
         with pytest.raises(Interrupted):
             run(config)
     peaks |= {"peak_memory_bytes": 5, "peak_device_memory_bytes": 3}
+    with monkeypatch.context() as patch:
+        stop_at(10, patch, lambda: failing())
+        failed, _ = run(config)
+    assert (failed.status, failed.peak_memory_bytes) == ("oom", 9)
+    config = replace(config, retry="failed")
     result, _ = run(config)
     assert (result.peak_memory_bytes, result.peak_device_memory_bytes) == (9, 3)
+
+
+def failing() -> None:
+    raise MemoryError("for the test")
 
 
 def test_ctrl_c_in_the_last_iteration_scores_at_the_next_start(config, monkeypatch):

@@ -65,7 +65,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     folder = image_folder(path, options.images)
     cameras = by_id(model_files.read_cameras(files["cameras"]), str(files["cameras"]))
     images = sorted(model_files.read_images(files["images"]), key=lambda image: image.id)
-    by_id(((image.id, image.name) for image in images), str(files["images"]))
+    by_id(((image.id, (image.name, *image.pose)) for image in images), str(files["images"]))
     points = model_files.Points({}, colored, frozenset())
     if "points3D" in files:
         points = model_files.read_points(files["points3D"])

@@ -177,10 +177,8 @@ def _similarity(element: XML.Element, where: str) -> Tensor:
         matrix = rigid(scale * rotation, translation)
     if not scale > 0:
         raise DataError(f"{where}: the scale is {scale.item():g}; it must be positive")
-    matrix[:3, :3] /= scale
-    unscaled = torch.linalg.inv(cam_from_pose(matrix, where))
-    unscaled[:3, :3] *= scale
-    return unscaled
+    axes = torch.tensor([*3 * [scale.item()], 1.0], dtype=torch.float64)  # of each column
+    return torch.linalg.inv(cam_from_pose(matrix / axes, where)) * axes
 
 
 def _numbers(element: XML.Element | None, count: int, where: str) -> Tensor:
