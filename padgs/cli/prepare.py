@@ -63,7 +63,7 @@ def prepare(
     check_range(0, MAX_SEED, seed=seed)
     check_range(0, MAX_THREADS, threads=threads)
     check_range(0.001, 1000, per_second=per_second)
-    target = Path(destination)
+    target = Path(destination).resolve()  # of a link to a larger disk
     try:
         with _bars() as tell:
             known = KnownLength(metres, camera_height, gps)

@@ -95,9 +95,9 @@ def pixel_weight(
     rows = ROW_WEIGHTS[name](height, dtype=dtype, device=device)[:, None]
     if mask is None:
         return rows
-    if not (mask > 0).any():
-        raise ValueError("the mask is 0 everywhere, so no pixel is left; correct the mask or remove the view")
-    return rows * mask.to(rows)
+    if not ((weight := rows * mask.to(rows)) > 0).any():
+        raise ValueError("the mask is 0 everywhere, or wherever pixels count; correct the mask or remove the view")
+    return weight
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

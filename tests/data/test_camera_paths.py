@@ -132,6 +132,12 @@ def test_looking_straight_up_gives_a_valid_pose():
 UP = (0.0, 0.0, 1.0)
 
 
+def test_keyframes_are_a_second_apart_at_any_rate(tmp_path):
+    keys = [{"position": [n, 0, 0], "look_at": [n, 0, 1]} for n in range(3)]
+    (tmp_path / "a.json").write_text(json.dumps({"keyframes": keys}))
+    assert [len(read_path(tmp_path / "a.json", None, UP, fps=fps)) for fps in (30, 60, 10)] == [60, 120, 20]
+
+
 def test_keyframes_are_interpolated(tmp_path):
     keys = [{"position": [0, 0, 0], "look_at": [5, 0, 0]}, {"position": [2, 0, 0], "look_at": [2, 3, 0]}]
     (tmp_path / "a.json").write_text(json.dumps({"keyframes": keys}))

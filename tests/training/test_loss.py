@@ -112,7 +112,7 @@ def test_wrong_options_are_named():
         pixel_weight("sphere", 8)
     with pytest.raises(ValueError, match="known: mean, channel_sum"):
         photometric_loss(image, image, torch.ones(8, 1), normalisation="sum")
-    with pytest.raises(ValueError, match="no pixel is left"):
+    with pytest.raises(ValueError, match="the mask is 0 everywhere"):
         pixel_weight("uniform", 8, torch.zeros(8, 16))
 
 
@@ -136,3 +136,10 @@ def test_the_gradient_by_a_target_that_asks_for_one_is_that_of_differences(dtype
         moved[place] += sign * step
         sides.append(photometric_loss(exact[0].detach(), moved, weight.double()).item())
     assert expected[1][place].item() == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4)
+
+
+def test_a_mask_that_leaves_only_pixels_of_no_weight_is_refused():
+    mask = torch.zeros(8, 16)
+    mask[0] = 1  # whose weight is 0
+    with pytest.raises(ValueError, match="the mask is 0 everywhere, or wherever pixels count"):
+        pixel_weight("end_rows", 8, mask)

@@ -23,9 +23,9 @@ CROP_COLOR = (255, 180, 40)
 class CropControls:
     """A box whose outside is not rendered: numbers, and handles at two corners."""
 
-    def __init__(self, client: Any, box: Box, model: Path, can_crop: bool, redraw: Callable[[object], None]) -> None:
-        """Add the controls; `box` is the initial one, `model` a run or a file, which commands name."""
-        self._client, self._model, self._redraw, self._shown = client, model, redraw, False
+    def __init__(self, client: Any, box: Box, command: str, can_crop: bool, redraw: Callable[[object], None]) -> None:
+        """Add the controls; `box` is the initial one, `command` the `padgs export` of the model, if any."""
+        self._client, self._export, self._redraw, self._shown = client, command, redraw, False
         size = float(np.ptp(box, axis=0).max()) or 1.0  # of a single Gaussian
         step = size / 200
         with client.gui.add_folder("crop", expand_by_default=False):
@@ -63,9 +63,9 @@ class CropControls:
     def _update(self, _: object = None) -> None:
         box = self.box
         self._command.content = ""
-        if box is not None and self._model.is_dir():  # padgs export opens runs only
+        if box is not None and self._export:
             numbers = " ".join(f"{c:.6g}" for corner in box for c in corner)
-            self._command.content = f"`padgs export {shlex.quote(str(self._model))} --crop '{numbers}'`"
+            self._command.content = f"`{self._export} --crop '{numbers}'`"
         self._draw()
         self._redraw(None)
 

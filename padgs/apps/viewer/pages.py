@@ -97,8 +97,10 @@ class Page:
         poses = torch.stack([view.cam_from_world for view in scene.panoramas])
         self._up = torch.tensor(gravity(poses).up, dtype=torch.float64)
         model = getattr(renderers[0].run, "file", folder)  # as commands name it
-        self._crop = CropControls(client, box, model, can_crop, self.redraw)
-        command = shlex.join(["padgs", "render", str(model), *renderers[0].run.opened_with])
+        words = [str(model), *renderers[0].run.opened_with]
+        export = shlex.join(["padgs", "export", *words]) if model.is_dir() else ""  # it opens runs only
+        self._crop = CropControls(client, box, export, can_crop, self.redraw)
+        command = shlex.join(["padgs", "render", *words])
         self._film = FilmControls(client, folder, command, scene.origin, lambda: self.state().cam_from_world, may_stop)
         self._frusta = [self._frustum(view) for view in self._views.values()]
         for control in (self._camera, self._layer, self._gain, self._run, self._fov, self._width, self._level):
@@ -158,10 +160,11 @@ class Page:
     def save_picture(self) -> None:
         """Let the browser download the picture, at full resolution."""
         with self._lock:
-            image = self.state().render(1.0)
+            image = (state := self.state()).render(1.0)
         content = BytesIO()
         Image.fromarray(image).save(content, "PNG")
-        self._client.send_file_download(f"{self._renderers[0].run.folder.name}.png", content.getvalue())
+        name = "-".join(renderer.run.folder.name for renderer in state.renderers)
+        self._client.send_file_download(f"{name}.png", content.getvalue())
 
     def _confirm_stop(self) -> None:
         gui = self._client.gui

@@ -33,7 +33,7 @@ def read_path(
     """Read the poses [F, 4, 4] of a file of keyframes, or a camera path of nerfstudio; a DataError names the place.
 
     Poses are resampled evenly to a number of `frames`; None: `fps` for each of the seconds that a camera path states,
-    else its own poses, or 30 poses between two keyframes. `up` is the default of keyframes with look_at.
+    else its own poses, or one second between two keyframes. `up` is the default of keyframes with look_at.
     `transforms_json` is the file from which the scene was read, if any.
     """
     if not file.exists():
@@ -51,7 +51,7 @@ def read_path(
         stated = content.get("up")
         upwards = stated.numbers(3) if stated else torch.tensor(up, dtype=torch.float64)
         poses = [_keyframe(entry, upwards) for entry in content["keyframes"].entries()]
-        frames = frames or 30 * (len(poses) - 1)
+        frames = frames or max(2, round(fps * (len(poses) - 1)))
     if len(poses) < 2:
         raise DataError(f"{file} has {len(poses)} poses; a path needs at least two")
     found = torch.stack(poses)

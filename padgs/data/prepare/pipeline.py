@@ -110,7 +110,7 @@ class _Job:
         if is_video(source):
             of_video = work.fingerprint(source, options)
             given = digest_of(of_video, options)
-            self.folder.open("video", digest_of(of_video, options, _LATE))
+            self.folder.open("video", f"{of_video.partition('|')[0]}|{options.per_second}")
             self.folder.run_once("frames", partial(self._extract_frames, source))
             source = self.work / "frames"
         with self.folder.step("images"):
@@ -131,6 +131,8 @@ class _Job:
 
     def run(self) -> Prepared:
         """Run all steps that are not done."""
+        if not all((self.work / "images" / short).exists() for short in self.files):  # the source has moved
+            (self.work / "views.done").unlink(missing_ok=True)
         with sfm.log_to(self.work / "log.txt"):
             self.folder.run_once("views", self._link_images)
             self.folder.run_once("features", self._extract_features)

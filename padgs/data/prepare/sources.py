@@ -66,7 +66,7 @@ def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[ND
     """Yield the sharpest frame [H, W, 3] of every interval of time that has a frame."""
     av = optional_module("av", video, "video")
     try:
-        with av.open(str(video)) as container:
+        with av.open(str(video.absolute())) as container:  # a name may begin like a protocol
             if not container.streams.video:
                 raise DataError(f"{video} holds no video stream; give a stitched 360-degree video")
             stream = container.streams.video[0]
@@ -140,14 +140,15 @@ def find_source(path: Path, mask: str) -> Source:
     """Read and check a folder of panoramas, or one that holds them in images/.
 
     `mask` is as `data.mask`: auto searches for mask.png and masks/ beside the images and beside an images/ folder. A
-    DataError names an unstitched file, fewer than two panoramas, an unusable image or mask, or names that differ only
-    in case or extension.
+    DataError names an unstitched file, fewer than two panoramas, an unusable image or mask, two equal images, or names
+    that differ only in case or extension.
     """
     if path.is_file() and path.suffix.lower() in UNSTITCHED:
         raise DataError(f"{path} {_NOT_STITCHED}")
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
-    folder = panorama_folder(path)
+    inside = image_folder(path, None)
+    folder = inside if all((path / name).is_relative_to(inside) for name in panoramas(path)) else path
     names = [check_name(name, str(folder)) for name in panoramas(folder)]
     others, ways_out = _others(folder)
     if len(names) < 2:
@@ -155,9 +156,13 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{found}; structure from motion needs at least two{ways_out}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
+    by_digest = {image.digest: name for name, image in images.items()}
+    if twins := [f"{name} and {by_digest[of.digest]}" for name, of in images.items() if by_digest[of.digest] != name]:
+        raise DataError(f"{folder} holds images that are the same: {listed(twins)}; remove one of each pair")
     for name in names[:: -(-len(names) // DECODED)]:
         refuse_dual_fisheye(decode(folder / name), folder / name)
-    no_pose, expected = torch.eye(4, dtype=torch.float64), mask_folder(path)
+    no_pose = torch.eye(4, dtype=torch.float64)
+    expected = path.parent if path.name.lower() == "images" and folder == path else path  # of masks
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
     capture = Capture("images", expected, folder, frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
@@ -182,11 +187,6 @@ def panoramas(folder: Path) -> list[str]:
     return [name for name in names if PurePosixPath(name).name.lower() not in others]
 
 
-def panorama_folder(path: Path) -> Path:
-    """Return the folder of the panoramas: the given one if there are images in it, else that of its images."""
-    return path if any("/" not in name for name in panoramas(path)) else image_folder(path, None)
-
-
 def _others(folder: Path) -> tuple[str, str]:
     """Count the files that are not images by suffix, and say what to do with them; both empty if there are none."""
     names = [name for name in file_names(folder) if not name.lower().endswith(EXTENSIONS)]
@@ -194,8 +194,3 @@ def _others(folder: Path) -> tuple[str, str]:
     firsts = [(next((name for name in names if name.lower().endswith(kinds)), None), way) for kinds, way in _WAYS_OUT]
     ways_out = "".join(f"; {name} {way}" for name, way in firsts if name)
     return listed(f"{count} {suffix}" for suffix, count in counts.most_common()), ways_out
-
-
-def mask_folder(path: Path) -> Path:
-    """Return the folder that is searched for masks: that of the panoramas, or its parent if it is called images."""
-    return path.parent if path.name.lower() == "images" and panorama_folder(path) == path else path

@@ -105,9 +105,10 @@ class Prepared:
 
 def find_result(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
     """Return the result of an earlier call with the same input and options, if there is one."""
+    given = digest_of(fingerprint(source, options), options)
     try:
         record = json.loads((destination / PREPARED).read_text(encoding="utf-8"))
-        if record["input"] != digest_of(fingerprint(source, options), options):
+        if record["input"] != given:
             return None
         registered, unregistered, notes = (tuple(record[name]) for name in ("registered", "unregistered", "notes"))
         return Prepared(destination, registered, unregistered, record["points"], record["observations"], notes=notes)
@@ -121,6 +122,8 @@ def fingerprint(source: Path, options: PrepareOptions) -> str:
         return find_source(source, options.mask).fingerprint
     digests, mask = [_file_digest(source)], mask_path(options.mask.removeprefix("inverted:"), Path())
     if mask is not None:
+        if not mask.exists():
+            raise DataError(f"--mask {options.mask}: no such file or folder")
         files = sorted(file for file in (mask, *mask.rglob("*")) if file.is_file())
         digests += [f"{file.relative_to(mask)}:{_file_digest(file)}" for file in files]
     return "|".join(digests)

@@ -49,9 +49,9 @@ class PlusModel(SplatModel):
         self._finest: tuple[Tensor, Tensor] | None = None  # means, and the finest training pixel at each
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        events, begin = super().adapt(iteration, optimizer), max(1.0, self.options.supersampling_from * self.iterations)
-        several = self._long_config.supersampling
-        if several > self.supersampling and iteration - 1 < begin <= iteration and self._gains_by_supersampling():
+        before, begin = self._step, max(1.0, self.options.supersampling_from * self.iterations)
+        events, several = super().adapt(iteration, optimizer), self._long_config.supersampling
+        if several > self.supersampling and before < begin <= iteration and self._gains_by_supersampling():
             self._config = self._long_config
             events += (f"{several}x{several} samples a pixel",)
         return events

@@ -143,7 +143,8 @@ class Densifier:
             if left_out:
                 total = cloned + split + left_out
                 events.append(f"max_gaussians {options.max_gaussians} left out {left_out} of {total} candidates")
-        if iteration % options.reset_every == 0:
+        # After a reset rounds must follow, as in the published schedule.
+        if iteration % options.reset_every == 0 and iteration + 2 * options.densify_every < options.densify_until:
             self._reset_opacities(optimizer)
             events.append("reset opacities")
         return tuple(events)

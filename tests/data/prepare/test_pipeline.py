@@ -116,6 +116,24 @@ def test_an_interrupted_call_resumes_with_the_same_result(scene, prepared, tmp_p
         assert (out / "sparse" / "0" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
+def test_images_are_linked_again_where_their_source_has_moved(scene, prepared, tmp_path):
+    first, out = shutil.copytree(scene[1], tmp_path / "first"), tmp_path / "out"
+
+    def interrupt(step, done, total):
+        if step == "features":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare(first, out, PrepareOptions(threads=1), interrupt)
+    first.rename(tmp_path / "second")
+    assert len(prepare(tmp_path / "second", out, PrepareOptions(threads=1)).registered) == len(prepared[0].registered)
+
+
+def test_a_wrong_source_is_not_blamed_on_the_result(scene, prepared, tmp_path):
+    with pytest.raises(DataError, match="absent is not a folder; give a folder of panoramas"):
+        prepare(tmp_path / "absent", prepared[1], PrepareOptions(threads=1))
+
+
 def test_other_input_starts_over(scene, tmp_path):
     """Check that a working folder is reused only for the same images and options."""
     out, work = tmp_path / "done", tmp_path / ".done.prepare"

@@ -2,9 +2,11 @@
 
 import errno
 import os
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -19,8 +21,13 @@ from padgs.results import CONFIG_NAME, PICTURES
 
 def save(path, value=100, size=(16, 32)):
     path.parent.mkdir(parents=True, exist_ok=True)
-    shape = (*size, 3) if path.name != "mask.png" and "masks" not in path.parts else size
-    Image.fromarray(np.full(shape, value, np.uint8)).save(path)
+    is_mask = path.name.lower() == "mask.png" or "masks" in path.parts
+    pixels = np.full(size if is_mask else (*size, 3), value, np.uint8)
+    if not is_mask:
+        pixels.reshape(-1)[:4] = np.frombuffer(
+            crc32(str(path).encode()).to_bytes(4, "big"), np.uint8
+        )  # none is another
+    Image.fromarray(pixels).save(path)
 
 
 def test_images_masks_and_notes(tmp_path):
@@ -283,3 +290,25 @@ def test_write_errors_are_not_reported_as_decoding_errors(tmp_path, monkeypatch)
     with pytest.raises(OSError, match="No space left on device") as refused:
         extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
     assert refused.value.errno == errno.ENOSPC
+
+
+def test_two_equal_images_are_refused_before_any_work(tmp_path):
+    for name in ("a.png", "b.png"):
+        save(tmp_path / name)
+    shutil.copy(tmp_path / "a.png", tmp_path / "a (1).png")
+    with pytest.raises(DataError, match=r"images that are the same: a.*; remove one of each pair"):
+        find_source(tmp_path, "auto")
+
+
+def test_panoramas_beside_a_folder_of_images_are_used_too(tmp_path):
+    for name in ("images/a.png", "images/b.png", "garden/c.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        save(tmp_path / name)
+    assert list(find_source(tmp_path, "auto").images) == ["garden/c.png", "images/a.png", "images/b.png"]
+    assert list(find_source(tmp_path / "images", "auto").images) == ["a.png", "b.png"]
+
+
+def test_a_missing_mask_of_a_video_is_refused_before_it_is_decoded(tmp_path):
+    (tmp_path / "tour.mp4").write_bytes(b"a film")
+    with pytest.raises(DataError, match="--mask absent.png: no such file or folder"):
+        fingerprint(tmp_path / "tour.mp4", PrepareOptions(mask="absent.png"))

@@ -223,6 +223,14 @@ def test_nothing_happens_from_densify_until():
     assert [i for i in range(1, 200) if grown.adapt(i, optimizer)] == [10, 20, 30]
 
 
+@pytest.mark.parametrize(("iterations", "resets"), [(1000, 0), (1002, 0), (1500, 1), (3000, 2), (3002, 2), (7004, 4)])
+def test_rounds_follow_each_reset_as_in_the_published_schedule(iterations, resets):
+    options = DensificationOptions().for_run(iterations)
+    windows = {name: getattr(options, name) for name in ("densify_until", "reset_every", "densify_every")}
+    grown, optimizer = densifier([SMALL], densify_from=10**6, **windows)
+    assert sum("reset opacities" in grown.adapt(i, optimizer) for i in range(1, iterations)) == resets
+
+
 def test_windows_follow_the_run_length():
     published = DensificationOptions()
     assert published.for_run(30_000) == published
