@@ -24,8 +24,7 @@ FOLDER = ".multirun"  # in run.folder
 FILE_NAME = "finished.jsonl"
 # Settings that decide nothing about training, or only whether and where it is done.
 IGNORED = (*results.OF_THE_MACHINE, "launcher", "tracking", "retry", "hydra")
-# Files outside `data.path`: another run, which may have another model by now, and files beside the data; and values
-# that are not in the text.
+# Files outside `data.path`, such as another run, which may have another model by now, and values not in the text.
 OTHER_FILES = re.compile(r"\+*(init[.=]|data\.(images|mask|points)=)|.*\$\{")
 
 

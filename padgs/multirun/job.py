@@ -212,6 +212,5 @@ def _message(error: Exception) -> str:
 
 
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:
-    """Return whether the launcher runs jobs in other processes than its own."""
-    # joblib runs a single job at a time in its own process.
+    """Return whether the launcher runs jobs in other processes; joblib does not if it runs one at a time."""
     return not str(hydra.launcher._target_).endswith("BasicLauncher") and hydra.launcher.get("n_jobs") != 1

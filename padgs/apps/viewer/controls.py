@@ -23,9 +23,9 @@ CROP_COLOR = (255, 180, 40)
 class CropControls:
     """A box whose outside is not rendered: numbers, and handles at two corners."""
 
-    def __init__(self, client: Any, box: Box, command: str, can_crop: bool, redraw: Callable[[object], None]) -> None:
-        """Add the controls; `box` is the initial one, `command` the `padgs export` of the model, if any."""
-        self._client, self._export, self._redraw, self._shown = client, command, redraw, False
+    def __init__(self, client: Any, box: Box, words: str, can_crop: bool, redraw: Callable[[object], None]) -> None:
+        """Add the controls; `box` is the initial one, `words` those of `padgs export` that open the model, if any."""
+        self._client, self._words, self._redraw, self._shown = client, words, redraw, False
         size = float(np.ptp(box, axis=0).max()) or 1.0  # of a single Gaussian
         step = size / 200
         with client.gui.add_folder("crop", expand_by_default=False):
@@ -63,9 +63,9 @@ class CropControls:
     def _update(self, _: object = None) -> None:
         box = self.box
         self._command.content = ""
-        if box is not None and self._export:
+        if box is not None and self._words:
             numbers = " ".join(f"{c:.6g}" for corner in box for c in corner)
-            self._command.content = f"`{self._export} --crop '{numbers}'`"
+            self._command.content = f"`padgs export {self._words} --crop '{numbers}'`"
         self._draw()
         self._redraw(None)
 
@@ -87,15 +87,15 @@ class FilmControls:
     """Keyframes of a camera path, saved as a file that `padgs render --path` reads."""
 
     def __init__(
-        self, client: Any, folder: Path, command: str, origin: Tensor, pose: Callable[[], Tensor], may_write: bool
+        self, client: Any, folder: Path, words: str, origin: Tensor, pose: Callable[[], Tensor], may_write: bool
     ) -> None:
         """Add the controls to a `viser.ClientHandle`.
 
-        `folder` is that of the run or beside a file, `command` the `padgs render` that opens the model. Paths are
+        `folder` is that of the run or beside a file, `words` those of `padgs render` that open the model. Paths are
         stored in the world of the data set, where the scene has its `origin`; `pose` returns the current
         cam_from_world. `may_write`: save beside the run; else the browser downloads the file.
         """
-        self._client, self._folder, self._command, self._origin, self._pose = client, folder, command, origin, pose
+        self._client, self._folder, self._words, self._origin, self._pose = client, folder, words, origin, pose
         self._may_write, self.keyframes = may_write, list[Tensor]()
         with client.gui.add_folder("film", expand_by_default=False):
             client.gui.add_button("add view").on_click(lambda _: self.change(self.keyframes.append, self._pose()))
@@ -128,4 +128,4 @@ class FilmControls:
         except OSError as error:
             self.words.content = f"cannot write {file}: {error.strerror or error}"
             return
-        self.words.content = f"saved. `{self._command} --path {shlex.quote(str(file))}`"
+        self.words.content = f"saved. `padgs render {self._words} --path {shlex.quote(str(file))}`"

@@ -97,11 +97,9 @@ class Page:
         poses = torch.stack([view.cam_from_world for view in scene.panoramas])
         self._up = torch.tensor(gravity(poses).up, dtype=torch.float64)
         model = getattr(renderers[0].run, "file", folder)  # as commands name it
-        words = [str(model), *renderers[0].run.opened_with]
-        export = shlex.join(["padgs", "export", *words]) if model.is_dir() else ""  # it opens runs only
-        self._crop = CropControls(client, box, export, can_crop, self.redraw)
-        command = shlex.join(["padgs", "render", *words])
-        self._film = FilmControls(client, folder, command, scene.origin, lambda: self.state().cam_from_world, may_stop)
+        words = shlex.join([str(model), *renderers[0].run.opened_with])
+        self._crop = CropControls(client, box, words if model.is_dir() else "", can_crop, self.redraw)
+        self._film = FilmControls(client, folder, words, scene.origin, lambda: self.state().cam_from_world, may_stop)
         self._frusta = [self._frustum(view) for view in self._views.values()]
         for control in (self._camera, self._layer, self._gain, self._run, self._fov, self._width, self._level):
             control.on_update(self.redraw)

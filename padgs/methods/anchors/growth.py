@@ -18,6 +18,7 @@ from padgs.training.optimizer import append_rows, keep_rows
 from padgs.training.schedule import scaled
 
 MIN_GROW_EVERY = 50  # iterations; below it `eligible_share` averages over too few views
+LEAST_SHARE = 0.5  # of the iterations planned for a round
 PUBLISHED_THRESHOLD = 2e-4
 
 
@@ -124,7 +125,10 @@ class Growth:
         options = self.options
         if not options.grow_from < iteration < options.grow_until or iteration % options.grow_every:
             return ()
-        return (*self._grow(optimizer), *self._prune(optimizer))
+        # By the clock iterations skip steps: a round after fewer iterations is judged by these, or left out.
+        planned = max(1, min(options.grow_every, iteration - options.statistics_from))
+        share = min(1.0, self.statistics["decoded"].max().item() / planned)
+        return (*self._grow(optimizer, share), *self._prune(optimizer, share)) if share >= LEAST_SHARE else ()
 
     def keep(self, rows: Tensor, optimizer: torch.optim.Adam | None) -> None:
         """Keep these anchors only, [A] bool or row numbers, with their statistics and Adam moments."""
@@ -132,9 +136,9 @@ class Growth:
         self.model.positions = self.model.positions[rows]
         self.statistics = {name: values[rows] for name, values in self.statistics.items()}
 
-    def _grow(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+    def _grow(self, optimizer: torch.optim.Adam, share: float) -> tuple[str, ...]:
         model, options, statistics = self.model, self.options, self.statistics
-        eligible = statistics["seen"] > options.eligible_share * options.grow_every
+        eligible = statistics["seen"] > options.eligible_share * share * options.grow_every
         mean_gradient = torch.where(eligible, statistics["gradient"] / statistics["seen"].clamp(min=1), -1.0)
         new_anchors = find_new_anchors(model, mean_gradient.view(-1), options, self.generator)
         for name in ("gradient", "seen"):
@@ -160,9 +164,9 @@ class Growth:
         }
         return (f"grew {len(new_anchors)} anchors", *events)
 
-    def _prune(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+    def _prune(self, optimizer: torch.optim.Adam, share: float) -> tuple[str, ...]:
         model, options, statistics = self.model, self.options, self.statistics
-        judged = statistics["decoded"] > options.prune_share * options.grow_every
+        judged = statistics["decoded"] > options.prune_share * share * options.grow_every
         faint = judged & (statistics["opacity"] < options.min_opacity * statistics["decoded"])
         for name in ("opacity", "decoded"):
             statistics[name].masked_fill_(judged, 0)

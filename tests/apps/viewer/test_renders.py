@@ -98,7 +98,7 @@ def test_saved_films_are_paths_in_the_world_of_the_data(tmp_path):
     client, origin = MagicMock(), torch.tensor([100.0, 0.0, 0.0], dtype=torch.float64)
     poses = [torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)]
     poses[1][:3, 3] = torch.tensor([0.0, 0.0, 1.0])
-    film = FilmControls(client, tmp_path, "padgs render a.ply --data D", origin, lambda: poses[0], True)
+    film = FilmControls(client, tmp_path, "a.ply --data D", origin, lambda: poses[0], True)
     film.save()
     assert "at least two" in film.words.content and not [*tmp_path.iterdir()]
     film.keyframes.extend(poses)

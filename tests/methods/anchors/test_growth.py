@@ -117,6 +117,8 @@ def ready(model, options, *, gradient, seen) -> Growth:
     growth = Growth(model, options)
     growth.statistics["gradient"].fill_(gradient * seen)
     growth.statistics["seen"].fill_(seen)
+    growth.statistics["decoded"].fill_(options.grow_every)
+    growth.statistics["opacity"].fill_(options.grow_every)
     return growth
 
 
@@ -129,6 +131,18 @@ def test_gaussians_seen_in_few_iterations_are_not_eligible(lucky, seen, grown):
     assert len(model) == 1 + grown
     left = growth.statistics["seen"][0]
     assert left.tolist() == ([0.0, 0.0] if grown else [seen, seen])  # only those that were judged start again
+
+
+@pytest.mark.parametrize(("iterations", "seen", "grown"), [(49, 49, 0), (60, 24, 0), (60, 25, 1), (200, 40, 0)])
+def test_by_the_clock_a_round_is_judged_by_its_iterations_or_left_out(iterations, seen, grown, lucky):
+    model = model_at([[0, 0, 0]])
+    move(model, 1, [0.5 * 160, 0.0, 0.0])
+    growth = ready(model, PUBLISHED, gradient=2.5e-4, seen=seen)
+    growth.statistics["decoded"].fill_(iterations)
+    growth.statistics["opacity"].fill_(iterations)
+    growth.adapt(1600, adam(model))
+    assert len(model) == 1 + grown
+    assert growth.statistics["decoded"][0] == (49 if iterations == 49 else 0), "too few are kept for the next round"
 
 
 def test_new_anchors_start_as_published(lucky):
@@ -152,8 +166,9 @@ def test_new_anchors_start_as_published(lucky):
 def test_ends_of_the_growth_window_are_exclusive(monkeypatch):
     growth = Growth(model_at([[0, 0, 0]]), PUBLISHED)
     optimizer = adam(growth.model)
-    monkeypatch.setattr(growth, "_grow", lambda optimizer: ("grew",))
-    monkeypatch.setattr(growth, "_prune", lambda optimizer: ())
+    monkeypatch.setattr(growth, "_grow", lambda optimizer, share: ("grew",))
+    monkeypatch.setattr(growth, "_prune", lambda optimizer, share: ())
+    growth.statistics["decoded"].fill_(100)
     rounds = [iteration for iteration in range(1, 30_001) if growth.adapt(iteration, optimizer)]
     assert rounds == list(range(1600, 15_000, 100))
 
@@ -221,7 +236,7 @@ def test_log_scale_cap_is_off_by_default(cap, expected):
     model = model_at([[0, 0, 0]])
     with torch.no_grad():
         model.log_scales.fill_(2.0)
-    Growth(model, GrowthOptions(log_scale_cap=cap)).adapt(1600, adam(model))
+    ready(model, GrowthOptions(log_scale_cap=cap), gradient=0.0, seen=0).adapt(1600, adam(model))
     assert torch.allclose(model.log_scales[0], torch.tensor([2.0] * 3 + [expected] * 3))
     assert GrowthOptions().log_scale_cap is None
 
@@ -231,14 +246,13 @@ def test_max_anchors_keeps_the_largest_gradients_and_reports_it(lucky):
     model = model_at(cells, offsets=1)
     with torch.no_grad():
         model.offsets[:, 0, 1] = 320 * VOXEL
-    growth = Growth(model, replace(PUBLISHED, max_anchors=7))
-    growth.statistics["seen"].fill_(50)
+    growth = ready(model, replace(PUBLISHED, max_anchors=7), gradient=0.0, seen=50)
     growth.statistics["gradient"].copy_(50 * torch.tensor([2.1e-4, 3.9e-4, 2.2e-4, 3.8e-4, 1e-5])[:, None])
     events = growth.adapt(1600, adam(model))
     assert events == ("grew 2 anchors", "max_anchors 7 left out 2 of 4 new anchors")
     assert model.positions[5:, 0].tolist() == [64 * VOXEL, 3 * 64 * VOXEL]
-    growth.statistics["seen"].fill_(50)
-    growth.statistics["gradient"].fill_(50 * 3e-4)
+    for name, values in (("seen", 50), ("gradient", 50 * 3e-4), ("decoded", 100), ("opacity", 100)):
+        growth.statistics[name].fill_(values)
     assert growth.adapt(1700, adam(model)) == ("max_anchors 7 left out 3 of 3 new anchors",)
     assert len(model) == 7
 
