@@ -33,12 +33,12 @@ def check(
     from padgs.data.capture import DataOptions
     from padgs.data.check import check as look_through
 
-    more = {"points": points, "cameras": cameras, "split": split}
+    options = DataOptions(mask=mask, depth=depth, images=images or None, points=points, cameras=cameras, split=split)
     with Console().status("looking at the images") as status:
         report = look_through(
             Path(path),
             format=format,
-            options=DataOptions(mask=mask, depth=depth, images=images or None, **more),
+            options=options,
             overlay=None if overlay == "none" else Path(overlay) if overlay else overlay_path(Path(path)),
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )

@@ -108,10 +108,10 @@ def test_the_answers_of_the_readme(root, after_a_minute):
 
     answers = [
         f"padgs+ on three of these four scenes, {least} WS-PSNR or more above five published",
-        f"`spags_tuned`, with one sample, is {between(ahead, '.1f')} dB behind and draws a frame in {frames[1]:.0f} ms, padgs+ in "
-        f"{frames[0]:.0f}",
-        f"`spags_supersampled`, with four samples a pixel, is {between(sorted(ahead_of_samples)[1:], '.1f')} dB behind on three scenes, "
-        f"{-min(ahead_of_samples):.1f} ahead on the fourth",
+        f"`spags_tuned`, with one sample, is {between(ahead, '.1f')} dB behind and draws a frame in "
+        f"{frames[1]:.0f} ms, padgs+ in {frames[0]:.0f}",
+        f"`spags_supersampled`, with four samples a pixel, is {between(sorted(ahead_of_samples)[1:], '.1f')} dB behind "
+        f"on three scenes, {-min(ahead_of_samples):.1f} ahead on the fourth",
         f"{between(gains, '.1f')} dB WS-PSNR on each of nine scenes",
         f"it costs {between([gain for gain in at_poles if gain > 0], '.1f')} dB on eight scenes",
         f"gains {-at_poles[scenes.index('court')]:.1f} dB on the court",
