@@ -30,10 +30,9 @@ from padgs.runs.config import RunConfig
 from padgs.runs.console import say
 from padgs.runs.interrupt import Interrupted, answer_signals
 from padgs.runs.load import load_run
-from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
+from padgs.runs.run import REPORTED, Callback, Scene, is_out_of_memory, load_scene, memory_reason, run, start
 from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy
-from padgs.training.health import is_out_of_memory, memory_reason
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
 SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`

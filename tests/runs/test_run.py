@@ -128,6 +128,14 @@ def test_another_protocol_scores_the_finished_run_without_training(config, monke
     assert both.scores["sphere"].metrics["ws_psnr"] is not None
 
 
+def test_another_protocol_scores_a_run_whose_time_ran_out_too(config):
+    first, _ = run(config)
+    results.write(replace(first, status="timeout"), folder_of(config).path)
+    sphere = composed("protocol=sphere", "protocol.sphere.lpips=none").protocols
+    both, _ = run(replace(config, protocols={**config.protocols, **sphere}))
+    assert both.status == "timeout" and both.scores.keys() == {"paper", "sphere"}
+
+
 def test_scores_are_not_replaced_by_those_under_other_rules_of_the_same_name(config, monkeypatch):
     def under(*overrides):
         protocols = composed("protocol=paper", "protocol.paper.lpips=none", *overrides).protocols
@@ -243,8 +251,6 @@ def test_time_running_out_is_a_status_and_the_model_is_scored(config):
     assert result.scores["paper"].metrics["psnr"] is not None
     again, said = run(config)
     assert again == result and "finished before, nothing to do\n" in said, "it would have no more time than before"
-    sphere = composed("protocol=sphere", "protocol.sphere.lpips=none").protocols
-    assert run(replace(config, protocols={**config.protocols, **sphere}))[0].scores.keys() == {"paper", "sphere"}
 
 
 def test_a_run_folder_that_cannot_be_made_is_a_clear_error(config, tmp_path):

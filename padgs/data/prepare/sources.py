@@ -156,11 +156,11 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{found}; structure from motion needs at least two{ways_out}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
+    for name in names[:: -(-len(names) // DECODED)]:
+        refuse_dual_fisheye(decode(folder / name), folder / name)
     by_digest = {image.digest: name for name, image in images.items()}
     if twins := [f"{name} and {by_digest[of.digest]}" for name, of in images.items() if by_digest[of.digest] != name]:
         raise DataError(f"{folder} holds images that are the same: {listed(twins)}; remove one of each pair")
-    for name in names[:: -(-len(names) // DECODED)]:
-        refuse_dual_fisheye(decode(folder / name), folder / name)
     no_pose = torch.eye(4, dtype=torch.float64)
     expected = path.parent if path.name.lower() == "images" and folder == path else path  # of masks
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
