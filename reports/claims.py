@@ -222,10 +222,9 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
             row["as published"] = as_published(alike)
             row["failed"] = failures(ours.select(runs.loc[runs["place"] == place]))
-            rank = itemgetter("tested", "width", "iterations")
             kind = place.seen if place.dataset != published.BUILT_IN else ""
             scene = (place.dataset, place.scene.replace(OTHER_PATH, ""), kind)
-            best[scene] = max(row, best.get(scene, row), key=rank)
+            best[scene] = max(row, best.get(scene, row), key=itemgetter("tested", "width", "iterations"))
     rows = DataFrame(sorted(best.values(), key=lambda row: row["place"].rank))
     if claim.source == OURS and len(rows) and (untuned := rows["tested"] & (rows["seen"] == NOT_TUNED_ON)).any():
         rows["tested"] = untuned

@@ -90,9 +90,8 @@ class Multirun:
         self._console, self._say, self._finished = console, partial(say, console), FinishedJobs(self.runs)
         if config.retry not in RETRIES:
             raise ValueError(unknown("retry", config.retry, RETRIES))
-        # Configuration files from elsewhere are not known to the index.
-        elsewhere = "hydra.searchpath" in str(OmegaConf.select(config, "hydra.overrides.hydra"))
-        found = [None if elsewhere else self._finished.find(job) for job in jobs]
+        unindexed = "hydra.searchpath" in str(OmegaConf.select(config, "hydra.overrides.hydra"))
+        found = [None if unindexed else self._finished.find(job) for job in jobs]
         if config.retry == "failed":
             found = [None if known and known[0] in RETRIED else known for known in found]
         self.before = Counter(known[0] for known in found if known)

@@ -53,11 +53,14 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
     installed, that the file cannot be decoded, or that its frames are no panoramas.
     """
-    written = 0
-    for written, frame in enumerate(_sharpest(video, per_second, progress), 1):
+    written, last = 0, None
+    for frame in _sharpest(video, per_second, progress):
+        if np.array_equal(frame, last):  # of a still
+            continue
+        written, last = written + 1, frame
         Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
     if written < 2:
-        what = f"{video} gives {written} frames at {per_second:g} a second; structure from motion needs at least two"
+        what = f"{video} gives {written} different frames at {per_second:g} a second; structure from motion needs at least two"
         raise DataError(f"{what}: take more a second (`--per-second`), or a longer video")
     return written
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from padgs.data import DataError
 from padgs.data.assemble import PREPARED, SKIPPED
+from padgs.data.prepare import sources
 from padgs.data.prepare.sources import _pixels, extract_frames, find_source, is_video, sharpness
 from padgs.data.prepare.work import PrepareOptions, fingerprint
 from padgs.results import CONFIG_NAME, PICTURES
@@ -98,7 +99,7 @@ def test_a_video_with_one_frame_is_refused_by_its_name(tmp_path, monkeypatch):
     frames = iter([np.zeros((16, 32, 3), np.uint8)])
     monkeypatch.setattr("padgs.data.prepare.sources._sharpest", lambda *_: frames)
     with pytest.raises(
-        DataError, match=r"tour.mp4 gives 1 frames at 2 a second; .*: take more a second \(`--per-second`"
+        DataError, match=r"tour.mp4 gives 1 different frames at 2 a second; .*: take more a second \(`--per-second`"
     ):
         extract_frames(tmp_path / "tour.mp4", tmp_path, 2.0)
 
@@ -211,6 +212,13 @@ def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
     for name, index in (("frame_00001.jpg", 3), ("frame_00002.jpg", 16)):
         darkest = np.asarray(Image.open(tmp_path / name)).min()
         assert abs(int(darkest) - (40 + 5 * index)) < 12
+
+
+def test_equal_frames_of_a_still_are_written_once(tmp_path, monkeypatch):
+    still, moved = np.zeros((16, 32, 3), np.uint8), np.full((16, 32, 3), 9, np.uint8)
+    monkeypatch.setattr(sources, "_sharpest", lambda *_: iter([still, still, moved]))
+    assert extract_frames(tmp_path / "a.mp4", tmp_path, 1.0) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame_00001.jpg", "frame_00002.jpg"]
 
 
 def test_frames_are_chosen_by_time_at_a_variable_rate(tmp_path):
