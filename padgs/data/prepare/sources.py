@@ -60,7 +60,7 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
         written, last = written + 1, frame
         Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
     if written < 2:
-        what = f"{video} gives {written} different frames at {per_second:g} a second; structure from motion needs at least two"
+        what = f"{video} gives {written} different frames at {per_second:g} a second; poses need at least two"
         raise DataError(f"{what}: take more a second (`--per-second`), or a longer video")
     return written
 
