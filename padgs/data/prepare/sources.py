@@ -53,7 +53,7 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
     installed, that the file cannot be decoded, or that its frames are no panoramas.
     """
-    written, last = 0, None
+    written, last = 0, np.zeros(0, np.uint8)
     for frame in _sharpest(video, per_second, progress):
         if np.array_equal(frame, last):  # of a still
             continue
