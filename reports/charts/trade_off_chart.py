@@ -135,10 +135,8 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     drawing.lay_out(made, title)
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
     write_labels(panel, labels, [*ends, *_along(panel)])
-    lost = {point.title for point in trade_off.points} - {setting.title for setting, _, _ in curves}
-    notes = (
-        [f"Without a log of equal length in each scene, so without a line: {'; '.join(sorted(lost))}."] if lost else []
-    )
+    lost = "; ".join(sorted({point.title for point in trade_off.points} - {setting.title for setting, _, _ in curves}))
+    notes = [f"Without logs of one length in all scenes, so without a line: {lost}."] if lost else []
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, (*trade_off.notes, *notes))
 
 

@@ -150,8 +150,8 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{path} {_NOT_STITCHED}")
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
-    inside = image_folder(path, None)
-    folder = inside if all((path / name).is_relative_to(inside) for name in panoramas(path)) else path
+    every = panoramas(path)
+    folder = path if any("/" not in name for name in every) else image_folder(path, None)
     names = [check_name(name, str(folder)) for name in panoramas(folder)]
     others, ways_out = _others(folder)
     if len(names) < 2:
@@ -173,6 +173,8 @@ def find_source(path: Path, mask: str) -> Source:
     notes = [*image_files.notes_on(list(images.values())), *mask_notes]
     if others:
         notes.append(f"left out: {others}{ways_out}")
+    if beside := [name for name in every if not (path / name).is_relative_to(folder)]:  # such as reduced copies
+        notes.append(f"{len(beside)} images beside {folder.name}/ are not used: {listed(beside)}")
     read = {found.file.path for found in masks if found is not None and found.file is not None}
     unused = [name for name in image_names(folder) if name not in images and folder / name not in read]
     if mask == "auto" and (unused := [name for name in unused if PurePosixPath(name).name.lower() != OVERLAY]):

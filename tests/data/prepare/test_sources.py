@@ -308,12 +308,12 @@ def test_two_equal_images_are_refused_before_any_work(tmp_path):
         find_source(tmp_path, "auto")
 
 
-def test_panoramas_beside_a_folder_of_images_are_used_too(tmp_path):
-    for name in ("images/a.png", "images/b.png", "garden/c.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+def test_images_beside_the_folder_of_images_are_named(tmp_path):
+    for name in ("images/a.png", "images/b.png", "images_2/a.png"):
         save(tmp_path / name)
-    assert list(find_source(tmp_path, "auto").images) == ["garden/c.png", "images/a.png", "images/b.png"]
-    assert list(find_source(tmp_path / "images", "auto").images) == ["a.png", "b.png"]
+    found = find_source(tmp_path, "auto")
+    assert list(found.images) == ["a.png", "b.png"]
+    assert "1 images beside images/ are not used: images_2/a.png" in found.notes
 
 
 def test_a_missing_mask_of_a_video_is_refused_before_it_is_decoded(tmp_path):
