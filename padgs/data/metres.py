@@ -5,7 +5,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ _MAX_DEEPER = 0.05  # share of the points below the cameras that may lie below t
 _MIN_ABOVE_FLOOR = 0.7  # share of the cameras that have a point of the floor within their height, horizontally
 _MAX_HEIGHTS = 0.15  # standard deviation of the cameras' heights, relative to their median
 _MIN_SPREAD = 3.0  # metres, of GPS positions: their root mean square distance from their mean
+_NO_GPS = "; use --metres A B DISTANCE or --camera-height"
 _MAX_RESIDUAL = 0.15  # root mean square distance of cameras from their GPS positions, relative to that spread
 
 
@@ -95,6 +96,13 @@ def named(panoramas: Sequence[str], *names: str) -> list[int]:
     return [at[key] for key in keys]
 
 
+def refuse_useless(known: KnownLength, images: Mapping[str, Path]) -> None:
+    """Refuse a length that panoramas (name -> file) show to be useless before they have poses, by a DataError."""
+    named([*images], *(known.metres or ())[:2])
+    if known.gps:
+        _gps_places([*images.values()])
+
+
 def _by_distance(
     frames: Sequence[Frame], poses: Tensor, first: str, second: str, metres: float
 ) -> tuple[Similarity, str]:
@@ -154,27 +162,18 @@ def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[Simil
 
 def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     """Fit heading, scale and place of the world, upright by the cameras, to east, north and up."""
-    found = {k: place for k, frame in enumerate(frames) if (place := gps_of(frame.image)) is not None}
-    instead = "; use --metres A B DISTANCE or --camera-height"
-    if (different := len({place[:2] for place in found.values()})) < 3:
-        have = f"{len(found)} of {len(frames)} images have a GPS position, {different} different ones"
-        raise DataError(f"--gps: {have}, and at least 3 are needed{instead}")
-    origin, truth = local_metres([*found.values()])
+    found, origin, truth, spread = _gps_places([frame.image for frame in frames])
     level = Similarity.turning(_common_up(poses, "--gps"), Z).rotation
-    used = centers(poses)[[*found]]
+    used = centers(poses)[found]
     at = used @ level.mT
     theirs, ours = (torch.complex(of[:, 0], of[:, 1]) for of in (truth, at))
     theirs, ours = theirs - theirs.mean(), ours - ours.mean()
-    spread = theirs.abs().square().mean().sqrt().item()
     turn = (ours.conj() * theirs).sum() / ours.abs().square().sum()
     residual = (turn * ours - theirs).abs().square().mean().sqrt().item()
-    if not spread >= _MIN_SPREAD:
-        needed = f"and at least {_MIN_SPREAD:g} m are needed"
-        raise DataError(f"--gps: the positions spread by {spread:.3g} m, {needed}{instead}")
     if not residual <= _MAX_RESIDUAL * spread:
         raise DataError(
             f"--gps: cameras are {residual:.2g} m from their GPS positions (root mean square), more than "
-            f"{_MAX_RESIDUAL:.0%} of the spread of {spread:.3g} m; the fit is poor{instead}"
+            f"{_MAX_RESIDUAL:.0%} of the spread of {spread:.3g} m; the fit is poor{_NO_GPS}"
         )
     scale, angle = turn.abs().item(), turn.angle().item()
     c, s = math.cos(angle), math.sin(angle)
@@ -182,6 +181,20 @@ def _by_gps(frames: Sequence[Frame], poses: Tensor) -> tuple[Similarity, str]:
     change = Similarity(scale, rotation, truth.mean(0) - scale * rotation @ used.mean(0))
     axes = f"x is east, y north, z up from latitude, longitude, altitude {', '.join(f'{one:.7g}' for one in origin)}"
     return change, f"by GPS of {len(found)} images, {residual:.2g} m from the fit; {axes}"
+
+
+def _gps_places(images: Sequence[Path]) -> tuple[list[int], tuple[float, float, float], Tensor, float]:
+    """Return which images have a GPS position, the results of `local_metres` for these, and their horizontal spread."""
+    found = {k: place for k, image in enumerate(images) if (place := gps_of(image)) is not None}
+    if (different := len({place[:2] for place in found.values()})) < 3:
+        have = f"{len(found)} of {len(images)} images have a GPS position, {different} different ones"
+        raise DataError(f"--gps: {have}, and at least 3 are needed{_NO_GPS}")
+    origin, metres = local_metres([*found.values()])
+    spread = (metres[:, :2] - metres[:, :2].mean(0)).square().sum(1).mean().sqrt().item()
+    if not spread >= _MIN_SPREAD:
+        needed = f"and at least {_MIN_SPREAD:g} m are needed"
+        raise DataError(f"--gps: the positions spread by {spread:.3g} m, {needed}{_NO_GPS}")
+    return [*found], origin, metres, spread
 
 
 def gps_of(image: Path) -> tuple[float, float, float] | None:

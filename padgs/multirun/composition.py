@@ -39,6 +39,7 @@ ConfigStore.__deepcopy__ = lambda store, _: store  # type: ignore[attr-defined]
 # At import, because jobs in processes of their own resolve what was composed elsewhere.
 OmegaConf.register_new_resolver("is_dataset", lambda name, *, _root_: _root_.data.dataset == name, replace=True)
 OmegaConf.register_new_resolver("gpus_for", gpus_for, replace=True)
+OmegaConf.register_new_resolver("gpus_of_slurm", lambda device: None if device == "cpu" else 1, replace=True)
 _registered: list[tuple[Path, dict[str, Any]]] = []  # folder of `conf`, and methods, whose choices Hydra knows
 
 

@@ -46,6 +46,12 @@ def test_runs_of_ray_ask_for_the_gpu_that_they_use(monkeypatch, device, here, as
     assert config.hydra.launcher.ray.remote == {"num_cpus": 3, "num_gpus": asked}
 
 
+@pytest.mark.parametrize(("device", "asked"), [("cuda", 1), ("auto", 1), ("cpu", None)])
+def test_jobs_of_slurm_ask_for_a_gpu_unless_they_use_none(device, asked):
+    slurm = OmegaConf.load(root() / "conf" / "launcher" / "slurm.yaml")
+    assert OmegaConf.merge(slurm, {"run": {"device": device}}).hydra.launcher.gpus_per_node == asked
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["none", "local"])
 def test_a_sweep_that_was_killed_three_times_ends_as_if_nothing_had_been(start, tmp_path, launcher):

@@ -25,7 +25,7 @@ from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import ImageFile, decode
 from padgs.data.masks import MASK_FOLDERS, write_masks
-from padgs.data.metres import UPRIGHT, Z, moved, named, to_metres, write_unit
+from padgs.data.metres import UPRIGHT, Z, moved, refuse_useless, to_metres, write_unit
 from padgs.data.prepare import rig, sfm, work
 from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
@@ -38,7 +38,7 @@ _REMEDIES = (
     "--accurate"
 )
 
-_LATE = ("threads", "level", "known")  # options without influence on what the working folder keeps
+_LATE = ("threads", "level", "known", "mapper")  # options without influence on what the working folder keeps
 
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, total)
 
@@ -57,14 +57,19 @@ def prepare(
     full disk; intermediate results then stay in the hidden folder, and nothing is written to the destination.
     """
     options = options or PrepareOptions()
+    work.check_options(source, options)
     if result := _existing(source, destination, options):
         return result
     if destination.name in (*IMAGE_FOLDERS, *MASK_FOLDERS) and destination.resolve().parent == source.resolve():
         raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
     place = destination.absolute().with_name(f".{destination.name}.prepare")
-    lock = FileLock(place / work.LOCK)
     try:
         place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = f"its folder cannot be made, {error.strerror}"
+        raise DataError(f"cannot prepare {destination} ({why}); choose another path") from error
+    lock = FileLock(place / work.LOCK)
+    try:
         lock.acquire(timeout=0)
         if result := _existing(source, destination, options):  # of another process, in the meantime
             return result
@@ -115,7 +120,7 @@ class _Job:
             source = self.work / "frames"
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
-            named([*self.source.images], *(options.known.metres or ())[:2])  # a misspelt name, before all work
+            refuse_useless(options.known, {name: image.path for name, image in self.source.images.items()})
         first = next(iter(self.source.images.values()))
         self.threads = options.threads or work.threads_for(first.width, first.height)
         kept = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
@@ -137,7 +142,7 @@ class _Job:
             self.folder.run_once("views", self._link_images)
             self.folder.run_once("features", self._extract_features)
             self.folder.run_once("matches", self._match)
-            self.folder.run_once("poses", self._reconstruct)
+            self.folder.run_once("poses", self._reconstruct, self.options.mapper)
             with self.folder.step("result"):
                 return self._write()
 

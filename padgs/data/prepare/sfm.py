@@ -27,6 +27,12 @@ MIN_ANGLE = 1.5  # degrees between the rays to a point
 _PAIRS_PER_BATCH = 64  # of images
 
 
+def check_mapper(mapper: str) -> None:
+    """Refuse one of `MAPPERS` that the installed pycolmap does not have, by a DataError."""
+    if mapper == "global" and not hasattr(pycolmap := pycolmap_module(), "global_mapping"):
+        raise DataError(f"pycolmap {pycolmap.__version__} has no global mapper; update it, or leave out --mapper")
+
+
 @dataclass(frozen=True)
 class Group:
     """Images that share a camera."""
@@ -120,15 +126,13 @@ def reconstruct(
     """Compute poses and points; write a model for each part that cannot be connected to others, return their number.
 
     `views` is the number of views in a rig, else 1. `mapper` is one of `MAPPERS`: incremental adds one panorama after
-    the other, global places all at once; a DataError if the installed pycolmap cannot.
+    the other, global places all at once.
     """
     pycolmap = pycolmap_module()
     pycolmap.set_random_seed(seed)
     with pycolmap.Database.open(database) as found:
         total = found.num_images() // views
     if mapper == "global":
-        if not hasattr(pycolmap, "global_mapping"):
-            raise DataError(f"pycolmap {pycolmap.__version__} has no global mapper; update it, or leave out --mapper")
         options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
         adjustment = options.mapper.bundle_adjustment
         adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False

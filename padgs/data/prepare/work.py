@@ -19,9 +19,10 @@ from padgs.data.capture import DataError
 from padgs.data.masks import mask_path
 from padgs.data.metres import KnownLength
 from padgs.data.prepare.pairs import PAIRS
-from padgs.data.prepare.sfm import MAPPERS
+from padgs.data.prepare.sfm import MAPPERS, check_mapper
 from padgs.data.prepare.sources import find_source, is_video
 
+PER_SECOND = 2.0
 LOCK = ".lock"  # of the process that works in the folder
 MAX_THREADS = 8
 MEMORY_PER_THREAD = 600_000_000  # bytes, for panoramas of 2048 x 1024, and for matching any size
@@ -69,7 +70,7 @@ class PrepareOptions:
     pairs: str = "auto"  # auto | exhaustive | sequential (names in the order they were taken) | similar
     mask: str = "auto"  # auto (mask.png or masks/ with the images) | none | rows:959/1024 | a file or folder
     level: bool = True  # rotate the world so that the cameras' common up is +z
-    per_second: float = 2.0  # frames kept of a video
+    per_second: float = PER_SECOND  # frames kept of a video
     seed: int = 0
     mapper: str = "incremental"  # incremental | global
     known: KnownLength = KnownLength()  # sets the scale of the world
@@ -101,6 +102,18 @@ class Prepared:
         """Write prepare.json to a folder; `digest` identifies the input, see `digest_of`."""
         record = {**asdict(self), "folder": ".", "options": asdict(options), "input": digest}
         (folder / PREPARED).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
+
+
+def check_options(source: Path, options: PrepareOptions) -> None:
+    """Refuse options that this kind of input, or the installed pycolmap, does not have, by a DataError."""
+    check_mapper(options.mapper)
+    if not is_video(source):
+        if options.per_second != PER_SECOND:
+            raise DataError(f"--per-second {options.per_second:g}: {source} is no video; leave it out")
+    elif options.mask == "inverted":
+        raise DataError("--mask inverted: a video has no masks of its own; give their path: --mask inverted:PATH")
+    elif options.known.gps:
+        raise DataError("--gps: frames of a video have no GPS; use --metres A B DISTANCE or --camera-height")
 
 
 def find_result(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
@@ -178,11 +191,11 @@ class WorkFolder:
         yield
         self.seconds[name] = round(time.perf_counter() - start, 2)
 
-    def run_once(self, step: str, action: Callable[[], None]) -> None:
-        """Run a step unless its marker exists; an OSError if the disk is full."""
+    def run_once(self, step: str, action: Callable[[], None], way: str = "") -> None:
+        """Run a step unless its marker says that it ran in this way; an OSError if the disk is full."""
         marker = self.path / f"{step}.done"
         with self.step(step):
-            if not marker.exists():
+            if not (marker.exists() and marker.read_text() == way):
                 refuse_full(self.path)
                 action()
-                marker.touch()
+                marker.write_text(way)

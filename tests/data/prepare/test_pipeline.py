@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,6 +60,51 @@ def test_a_misspelt_camera_is_refused_before_any_work(scene, tmp_path, monkeypat
     name = next(iter(scene[1].glob("*.png"))).name
     with pytest.raises(DataError, match="--metres: no panorama with a pose is called 'nobody'; known: pano"):
         prepare(scene[1], tmp_path / "out", PrepareOptions(known=KnownLength(metres=(name, "nobody", 3.0))))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("", PrepareOptions(known=KnownLength(gps=True)), "--gps: 0 of 6 images have a GPS position"),
+        ("", PrepareOptions(per_second=5.0), "--per-second 5: .* is no video; leave it out"),
+        ("", PrepareOptions(mapper="global"), "has no global mapper; update it, or leave out --mapper"),
+        ("v.mp4", PrepareOptions(known=KnownLength(gps=True)), "--gps: frames of a video have no GPS"),
+        ("v.mp4", PrepareOptions(mask="inverted"), "a video has no masks of its own; give their path"),
+    ],
+)
+def test_options_that_the_input_or_the_installation_lacks_are_refused_before_any_work(
+    scene, tmp_path, monkeypatch, name, options, message
+):
+    monkeypatch.setattr(sfm, "pycolmap_module", lambda: SimpleNamespace(__version__="3.0"))
+    for module, work_of in ((sfm, "extract_features"), (pipeline, "extract_frames")):
+        monkeypatch.setattr(module, work_of, None)
+    source = tmp_path / name if name else scene[1]
+    if name:
+        source.touch()
+    with pytest.raises(DataError, match=message):
+        prepare(source, tmp_path / "out", options)
+    assert not (tmp_path / ".out.prepare").exists()
+
+
+def test_another_mapper_keeps_features_and_matches(scene, tmp_path, monkeypatch):
+    """Also check that the first mapper's model is not taken for that of the second."""
+    calls = []
+
+    def fail(database, folder, parts, *rest):
+        calls.append(rest[-1])
+        raise RuntimeError("stop")
+
+    monkeypatch.setattr(sfm, "reconstruct", fail)
+    monkeypatch.setattr(work, "check_mapper", lambda mapper: None)
+    source = noise(tmp_path / "in")
+    for mapper in ("incremental", "global"):
+        with pytest.raises(DataError, match="stop"):
+            prepare(source, tmp_path / "out", PrepareOptions(threads=1, mapper=mapper))
+        monkeypatch.setattr(sfm, "extract_features", None)
+    (tmp_path / ".out.prepare" / "poses.done").write_text("incremental")
+    with pytest.raises(DataError, match="stop"):
+        prepare(source, tmp_path / "out", PrepareOptions(threads=1, mapper="global"))
+    assert calls == ["incremental", "global", "global"]
 
 
 def test_a_finished_result_is_reused(scene, prepared):
@@ -279,6 +325,7 @@ def test_bad_input_is_refused(scene, tmp_path):
         (scene[1], tmp_path / "there", "nothing is overwritten"),
         (tmp_path / "absent", tmp_path / "out", "is not a folder"),
         (tmp_path / "absent.mp4", tmp_path / "out", "cannot be read"),
+        (scene[1], tmp_path / "there" / "file" / "out", "its folder cannot be made, Not a directory.*choose another"),
         (scene[1], scene[1] / "images", "images would be read as the images or masks of"),
     ):
         with pytest.raises(DataError, match=message):
