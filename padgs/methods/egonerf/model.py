@@ -154,7 +154,10 @@ class RayPixels:
         for view in views:
             image, of_pixel = image_of(view, device), weight_of(view, weight, device)
             if view.lens is not None and weight == "solid_angle":
-                of_pixel = of_pixel * (views[0].camera.focal / view.camera.focal) ** 2
+                scale = (views[0].camera.focal / view.camera.focal) ** 2
+            else:  # as where an iteration draws a whole view
+                scale = view.sphere_share * views[0].width * views[0].height / (view.width * view.height)
+            of_pixel = view.share * scale * of_pixel
             of_pixel = of_pixel.expand(view.height, view.width).reshape(-1)
             kept = of_pixel.nonzero().squeeze(-1)
             colors.append((image.reshape(-1, 3)[kept] * 255).round().to(torch.uint8))

@@ -43,7 +43,14 @@ def test_pixels_are_drawn_uniformly_over_all_views(views):
     assert in_photo == pytest.approx(48 / (48 + 2 * 512), abs=0.004)
     up = (rays.directions[:, 1] < -0.9).double().mean().item()
     assert up > 1.5 * 0.05, "over pixels, not over the sphere, of which that is a twentieth"
-    assert torch.equal(rays.weight, torch.ones(50_000))
+    assert torch.equal(RayPixels(views[:2]).draw(100).weight, torch.ones(100))
+
+
+def test_views_weigh_as_where_whole_views_are_drawn(views):
+    first, second, photo = views
+    views = [first, replace(second, share=0.3), replace(photo, sphere_share=0.1)]
+    weights = RayPixels(views).at(torch.arange(2 * 512 + 48)).weight.split((512, 512, 48))
+    assert [part.sum().item() / 512 for part in weights] == pytest.approx([1, 0.3, 0.1])
 
 
 def test_masks_select_and_weight_pixels(views):
