@@ -88,6 +88,7 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
         if key != "hydra"
     }
     _refuse_changed_rows(values, choices)
+    _refuse_replaced_settings(choices)
     return config_from_values(values, labels(choices))
 
 
@@ -108,6 +109,34 @@ def _refuse_changed_rows(values: Mapping[str, Any], choices: Mapping[str, object
                     f"+{path.stem}={chosen} means {setting}={value}, but {setting}={found} was set besides; leave out "
                     "one of the two"
                 )
+
+
+def _refuse_replaced_settings(choices: Mapping[str, object]) -> None:
+    """Refuse render=... or train=... where the method has such settings of its own, of which one would be lost."""
+    for group in {"render", "train"} & {*choices}:
+        method, chosen = str(choices["method"]), choices[group]
+        if (brought := _settings_of(method, group)) not in (None, chosen):
+            file = root() / "conf" / group / f"{chosen}.yaml"
+            keys = "".join(f" {group}.{key}={value}" for key, value in _table(file).items()) if file.exists() else ""
+            instead = f"; instead of it set{keys}" if keys else "; leave it out"
+            raise ConfigError(
+                f"{group}={chosen} is not for method={method}, which has own settings of {group}{instead}"
+            )
+
+
+def _settings_of(method: str, group: str) -> str | None:
+    """Return the choice of `render` or `train` that a method, or a file in `conf/method`, brings; None if it has none."""
+    path = root() / "conf" / "method" / f"{method}.yaml"
+    if not path.exists():
+        return method if group in dict(method_choices(method)) else None
+    file = _table(path)
+    brought = "default" if file.get(group) else None
+    for base in file["defaults"]:
+        if isinstance(base, str) and not base.startswith("/"):
+            brought = _settings_of(base, group) or brought
+        elif isinstance(base, dict):
+            brought = base.get(f"override /{group}", brought)
+    return brought
 
 
 def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:

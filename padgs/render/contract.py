@@ -41,6 +41,11 @@ LOW_PASS_KINDS = {  # of each projection, the default first; defined in `padgs.r
 }
 
 
+def _whole(most: int) -> Callable[[Any], bool]:
+    """Return a rule that holds for whole numbers from 1 to `most`."""
+    return lambda n: isinstance(n, int) and 1 <= n <= most
+
+
 @dataclass(frozen=True)
 class RenderOptions:
     """Options of the rasterizer. conf/render/released.yaml has those of the published rasterizer."""
@@ -64,9 +69,9 @@ class RenderOptions:
         check_known(self, bounds=BOUNDS, near_cull=NEAR_CULLS, blending=BLENDINGS)
         check(self, "a distance >= 0 in world units", lambda near: 0 <= near < math.inf, "near")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "low_pass")
-        check(self, f"from 1 to {MAX_SUPERSAMPLING}", lambda n: 1 <= n <= MAX_SUPERSAMPLING, "supersampling")
-        check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", lambda n: 1 <= n <= MAX_CORE_SIZE, "core_size")
-        check(self, "at least 1", lambda most: most >= 1, "max_instances")
+        check(self, f"from 1 to {MAX_SUPERSAMPLING}", _whole(MAX_SUPERSAMPLING), "supersampling")
+        check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", _whole(MAX_CORE_SIZE), "core_size")
+        check(self, "at least 1", _whole(1 << 62), "max_instances")
         if self.near_cull == "ellipsoid" and self.projection != "ray":
             raise ValueError(f"near_cull=ellipsoid requires projection 'ray', not {self.projection!r}; set mean")
         if self.core_size != CORE_SIZE and self.blending != "hybrid":
@@ -171,6 +176,8 @@ def check_inputs(request: Request) -> None:
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means has dtype {dtype}; renderers take torch.float32 or torch.float64")
     for name, (tensor, shape) in shapes.items():
+        if not isinstance(tensor, Tensor):
+            raise ValueError(f"{name} is a {type(tensor).__name__}; it must be a tensor of shape {shape}")
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}; with {count} means it must be {shape}")
         if tensor.dtype != dtype:

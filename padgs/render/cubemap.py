@@ -66,22 +66,31 @@ def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
 def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhole) -> Rendering:
     """Resample the renderings of six faces to a panorama, differentiably.
 
-    Depth is radial, so faces agree on it; depth times coverage is interpolated, so that depths do not mix with the
-    zeros of empty pixels. Counters are sums over the faces, except `gaussians` and `visible`.
+    Depth is radial, so faces agree on it. Counters are sums over the faces, except `gaussians` and `visible`.
     """
-    like = faces[0].image
-    pixels, weights = _corners(panorama, lens, like.device)
-    weights = weights.to(like.dtype)
-    coverage = torch.stack([1 - face.transmittance for face in faces])
-    depth = torch.stack([face.depth for face in faces]) * coverage
-    image = torch.stack([face.image for face in faces])
-    channels = torch.cat((image, coverage[..., None], depth[..., None]), dim=-1).flatten(0, 2)  # [6 S S, 5]
-    resampled = (weights[:, :, None] * channels[pixels]).sum(1)  # [H W, 5]
-    image, coverage, depth = resampled.view(panorama.height, panorama.width, 5).split((3, 1, 1), dim=-1)
+    channels = torch.stack([channels_of(face) for face in faces]).flatten(0, 2)  # [6 S S, 5]
+    pixels, weights = _corners(panorama, lens, channels.device)
+    resampled = (weights.to(channels)[:, :, None] * channels[pixels]).sum(1)  # [H W, 5]
+    visible = torch.stack([face.visible for face in faces]).any(0)
+    like = replace(faces[0], visible=visible, counters=summed_counters(faces, visible))
+    return from_channels(resampled.view(panorama.height, panorama.width, 5), like)
+
+
+def channels_of(rendering: Rendering) -> Tensor:
+    """Return image, coverage, and depth times coverage [H, W, 5], which may be interpolated.
+
+    Depth alone would mix with the zeros of empty pixels.
+    """
+    coverage = (1 - rendering.transmittance)[..., None]
+    return torch.cat((rendering.image, coverage, rendering.depth[..., None] * coverage), dim=-1)
+
+
+def from_channels(channels: Tensor, like: Rendering) -> Rendering:
+    """Return a rendering of interpolated channels [H, W, 5], otherwise like another one."""
+    image, coverage, depth = channels[..., :3], channels[..., 3], channels[..., 4]
     covered = coverage > 0
     depth = torch.where(covered, depth, 0) / torch.where(covered, coverage, 1)
-    visible = torch.stack([face.visible for face in faces]).any(0)
-    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, summed_counters(faces, visible))
+    return replace(like, image=image, transmittance=1 - coverage, depth=depth)
 
 
 def summed_counters(parts: Sequence[Rendering], visible: Tensor) -> LazyCounters:

@@ -47,7 +47,7 @@ def leave_one_out(
 
     `target` [H, W, 3] is the ground truth; only ratios of the pixels' weights [H, W] or [H, 1] >= 0 matter. With
     backend auto, tensors of a GPU are scored on the CPU if the library for it is missing. Raises ValueError as
-    `padgs.render.render` does, and for a target of another size than the view.
+    `padgs.render.render` does, for a target of another size than the view, and for weights of another or without sum.
     """
     device, resolved = gaussians.means.device, resolve_backend(backend, gaussians.means)
     if backend == "auto" and resolved == "torch" and device.type != "cpu":
@@ -64,8 +64,13 @@ def leave_one_out(
             f"the target has shape {list(target.shape)}, but the view is {view.camera.width}x{view.camera.height}; "
             f"it must be [{view.camera.height}, {view.camera.width}, 3]"
         )
-    target = target.to(gaussians.means)
-    weight = weight.to(target).expand(target.shape[:2])
+    target, weight = target.to(gaussians.means), weight.to(gaussians.means)
+    if weight.shape not in (target.shape[:2], (len(target), 1)) or not weight.sum() > 0:
+        raise ValueError(
+            f"weights have shape {list(weight.shape)} and sum {weight.sum().item():g}; they must be [H, W] or [H, 1] "
+            f"for a target of {list(target.shape)}, with a sum above 0"
+        )
+    weight = weight.expand(target.shape[:2])
     weight = (weight / weight.double().sum()).to(target).contiguous()
     backend_score: Backend = lookup(BACKENDS, resolved, "backend")
     if resolved != "torch" and is_in_blocks(view.camera):

@@ -118,7 +118,7 @@ def project_ray(request: Request) -> RayFootprints:
     radius, opacities = means.norm(dim=-1), gaussians.opacities
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
-    drawn = opacities.detach() >= ALPHA_MIN
+    drawn = (opacities.detach() >= ALPHA_MIN) & torch.isfinite(gaussians.scales.detach()).all(-1)
     largest = 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
     outside = distance > largest
     if options.near_cull == "ellipsoid":

@@ -245,7 +245,7 @@ def method_fields(name: str) -> dict[str, Any]:
 def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield group and node for Hydra of `method=NAME`, and of its own render and train settings, if it has any.
 
-    These are choices as well, so that render=... and train=... on a command line replace them.
+    These are choices as well, so that a file in `conf/method` can replace them. On a command line that is refused.
 
     >>> list(method_choices("op43dgs"))[0]
     ('render', {'render': {'projection': 'tangent'}})

@@ -16,7 +16,7 @@ from padgs.geometry.distortion import solid_angle_weight
 from padgs.geometry.lens import axis_direction, bend, hemisphere_weight
 from padgs.geometry.panorama import project, rays, sample_pixels
 from padgs.render import Rendering
-from padgs.render.cubemap import summed_counters
+from padgs.render.cubemap import channels_of, from_channels, summed_counters
 from padgs.scene import View
 from padgs.training.loss import pixel_weight
 from padgs.training.model import TrainingRender
@@ -96,10 +96,7 @@ class CameraMap(nn.Module):
         if self._inverse is None or not torch.equal(self._inverse[0], directions):
             self._inverse = directions, self.ideal_pixels()
         height, width = ideal.depth.shape
-        layers = torch.cat((ideal.image, ideal.transmittance[..., None], ideal.depth[..., None]), dim=-1)
-        layers = sample_pixels(layers, self._resized(self._inverse[1], width, height))
-        image, transmittance, depth = layers.split((3, 1, 1), dim=-1)
-        return replace(ideal, image=image, transmittance=transmittance[..., 0], depth=depth[..., 0])
+        return from_channels(sample_pixels(channels_of(ideal), self._resized(self._inverse[1], width, height)), ideal)
 
     def directions(self) -> Tensor:
         """Return unit directions [H, W, 3] in the image for each pixel of the ideal panorama."""
@@ -219,10 +216,13 @@ class DualLens(nn.Module):
 def stitched(front: Rendering, back: Rendering, weight: Tensor) -> Rendering:
     """Blend two renderings of the same Gaussians by `weight` [H, W] of the front; equal pixels do not change."""
     weight, visible = weight.to(front.image), front.visible | back.visible
+    of_front, of_back = weight * (1 - front.transmittance), (1 - weight) * (1 - back.transmittance)
+    covered = of_front + of_back
+    share = of_front / covered.where(covered > 0, 1)  # depth is the mean over what is drawn
     return Rendering(
         image=torch.lerp(back.image, front.image, weight[..., None]),
         transmittance=torch.lerp(back.transmittance, front.transmittance, weight),
-        depth=torch.lerp(back.depth, front.depth, weight),
+        depth=torch.lerp(back.depth, front.depth, share),
         visible=visible,
         counters=summed_counters((front, back), visible),
     )

@@ -54,6 +54,8 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
         render(gaussians, VIEW, background=torch.zeros(3, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"mean_offsets has shape \(5, 3\); with 5 means it must be \(5, 2\)"):
         render(gaussians, VIEW, mean_offsets=torch.zeros(5, 3))
+    with pytest.raises(ValueError, match=r"background is a tuple; it must be a tensor of shape \(3,\)"):
+        render(gaussians, VIEW, background=(0.0, 0.0, 0.0))
     for projection, count, message in (
         ("erp", 5, "requires projection 'ray', not 'erp'"),
         ("ray", 1, r"has shape \(1,\)"),
@@ -84,6 +86,8 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
         ({"core_size": 0}, "core_size is 0; it must be from 1 to 256"),
         ({"core_size": 257}, "core_size is 257; it must be from 1 to 256"),
         ({"core_size": 8}, "core_size is 8, but blending=sorted has no core; set blending=hybrid or core_size=16"),
+        ({"supersampling": 1.5}, "supersampling is 1.5; it must be from 1 to 8"),
+        ({"core_size": 3.5, "blending": "hybrid"}, "core_size is 3.5; it must be from 1 to 256"),
         ({"cubemap": True}, "projection 'erp' cannot render the faces of a cubemap; set pinhole, tangent or ray"),
     ],
 )

@@ -81,6 +81,11 @@ def test_targets_have_any_dtype_but_the_size_of_the_view():
         ValueError, match=r"target has shape \[4, 16, 3\], but the view is 16x8; it must be \[8, 16, 3\]"
     ):
         leave_one_out(gaussians, view, target[:4], weight[:4], SHARP, backend="cpu")
+    for unusable in (weight[0], weight[:, :8], 0 * weight):
+        with pytest.raises(
+            ValueError, match=r"weights have shape .* or \[H, 1\] for a target of \[8, 16, 3\], with a sum"
+        ):
+            leave_one_out(gaussians, view, target, unusable, SHARP, backend="cpu")
 
 
 @cases.each_setup

@@ -15,7 +15,7 @@ from padgs.geometry.panorama import direction, rays, sample_pixels
 from padgs.render import RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.corrections import Corrections
-from padgs.training.lenses import CameraMap, DualLens
+from padgs.training.lenses import CameraMap, DualLens, stitched
 from padgs.training.model import TrainingRender
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.targets import Targets
@@ -217,6 +217,21 @@ def test_maps_of_another_size_are_the_same_camera():
         pixels = camera._resized(camera.source_pixels(), width, width // 2)
         moved.append((pixels - CameraMap(width, width // 2)._centers)[0, 0].detach() / width)
     torch.testing.assert_close(*moved, atol=2e-3, rtol=0)
+
+
+def test_depth_does_not_mix_with_that_of_empty_pixels():
+    """Check that one opaque ball in a void has one depth, through both kinds of cameras."""
+    turn = torch.tensor([[1.0, 0, 0, 0]])
+    ball = Gaussians(torch.tensor([[0.0, 0, 5]]), turn, torch.full((1, 3), 0.5), torch.tensor([0.95]), torch.ones(1, 3))
+    view = View("v", torch.eye(4, dtype=torch.float64), W, H)
+    ideal = render(ball, view, RenderOptions("ray"))
+    camera = distorted().float()
+    empty = replace(ideal, image=0 * ideal.image, transmittance=0 * ideal.depth + 1, depth=0 * ideal.depth)
+    half = torch.full((H, W), 0.5)
+    for rendering in (camera.photographed(ideal), stitched(ideal, empty, half), stitched(empty, ideal, half)):
+        drawn = rendering.transmittance < 0.999
+        assert drawn.sum() > 20
+        torch.testing.assert_close(rendering.depth[drawn], torch.full((int(drawn.sum()),), 5.0), atol=1e-4, rtol=0)
 
 
 def test_photographs_of_a_learned_camera_survive_storing():

@@ -64,6 +64,7 @@ def export_run(
         if distillation_steps != DISTILLATION_STEPS:
             notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
+            # Square pixels, also after training with several samples: for viewers with one, this is nearer to the run.
             splats, smooth = smoothed(splats, cameras_of(run.scene.train), config.low_pass), False
             notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
     elif isinstance(model, AnchorModel):

@@ -102,8 +102,7 @@ class SplatModel:
             offsets = splats.means.new_zeros(len(splats), OFFSET_COLUMNS[kind], requires_grad=True)
         gaussians, absolute = splats.displaced(view, None if kind == "image" else offsets)
         gaussians, options = self._training_gaussians(gaussians), self.render_options(view)
-        if self._step < self.options.supersampling_from * self.iterations:
-            options = replace(options, supersampling=1)
+        options = replace(options, supersampling=self._training_samples)
         if kind == "image":
             rendering = self._rendered(gaussians, view, options, mean_offsets=offsets)
         else:
@@ -258,11 +257,20 @@ class SplatModel:
     @torch.no_grad()
     def _rendered_opacities(self) -> Tensor:
         """Return opacities [N] as rendered by the training camera with the finest pixel; 3D filters lower them."""
-        splats, variance = self.splats, 0.0 if self._filter is None else self._filter.square_pixels
+        splats, cameras = self.splats, cameras_of(self._views)
+        added = 0.0 if self._filter is None else self._filter.square_pixels
+        variances = added * finest_pixels(splats.means, cameras).square()
         if self._config.resolved_low_pass_kind == "solid":
-            variance += self._config.low_pass
-        squared = finest_pixels(splats.means, cameras_of(self._views)).square()
-        return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), variance * squared)[1]
+            samples = torch.tensor([self.render_options(view).low_pass for view in self._views]).to(cameras)
+            cameras[:, 3] *= self._training_samples / samples.sqrt()  # as if the low-pass were one square pixel
+            variances = variances + finest_pixels(splats.means, cameras).square()
+        return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), variances)[1]
+
+    @property
+    def _training_samples(self) -> int:
+        """Samples along each side of a pixel in the next training render."""
+        begins = self.options.supersampling_from * self.iterations
+        return 1 if self._step < begins else self._config.supersampling
 
     @property
     def supersampling(self) -> int:

@@ -8,10 +8,13 @@ from support.composed import composed
 from support.rates import assert_log_linear
 from support.tiny_scene import tiny_scene
 
+from padgs.baselines.op43dgs import OP43DGSModel, OP43DGSOptions
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
+from padgs.render.projection import low_pass_filtered, low_pass_of
+from padgs.render.supersampling import with_smaller_pixels
 from padgs.runs.run import build_method
 from padgs.scene import Scene
 from padgs.training.initial_points import ExtentOptions
@@ -34,6 +37,23 @@ LENGTHS = {"means": EXTENT}  # what a rate is multiplied by
 def trainable(iterations: int = PUBLISHED_ITERATIONS) -> SplatModel:
     splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
     return SplatModel(splats, SplatOptions(), RenderConfig(), extent=EXTENT, iterations=iterations)
+
+
+@pytest.mark.parametrize(("step", "samples"), [(0, 1), (50, 2)])
+@pytest.mark.parametrize(
+    ("kind", "options"), [(SplatModel, SplatOptions()), (OP43DGSModel, OP43DGSOptions(fixed_low_pass=True))]
+)
+def test_rendered_opacities_are_those_of_the_renderer(kind, options, step, samples):
+    view, options = tiny_scene().train[0], replace(options, supersampling_from=0.5)
+    splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
+    config = RenderConfig("ray", low_pass=0.3, supersampling=2)
+    model = kind(splats, options, config, extent=EXTENT, iterations=100, views=[view])
+    model._step = step
+    camera = with_smaller_pixels(view.camera, samples)
+    gaussians, pose = model.splats.gaussians(view), view.cam_from_world.float()
+    means = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    drawn = low_pass_filtered(gaussians, means, low_pass_of(model.render_options(view), camera))
+    torch.testing.assert_close(model._rendered_opacities(), drawn.opacities, rtol=1e-4, atol=0)
 
 
 def travelling(scene: Scene, times: float) -> Scene:
