@@ -104,6 +104,11 @@ class Cubemap3DGSMethod(SplatMethod):
 class Crops3DGSMethod(Cubemap3DGSMethod):
     """The same on twelve overlapping crops; see `Cubemap3DGSMethod`."""
 
+    def refuse_budget(self, budget: Budget) -> None:
+        super().refuse_budget(budget)
+        if budget.stop == "auto":
+            raise ValueError("budget.stop is auto, but other crops overlap those that would be held out; set it to end")
+
     def turns(self) -> Tensor:
         """Return rotations [12, 3, 3] from the camera frame of a panorama to those of the crops."""
         return looking_at(ICOSAHEDRON)

@@ -80,6 +80,7 @@ LIMITS: dict[object, tuple[int, int]] = {
     int: (0, 10**9),
     float: (-(10**6), 10**6),
 }
+MEASURED = ("timing", "counts")  # groups of results, whose numbers are at least 0
 T = TypeVar("T")
 
 
@@ -133,6 +134,8 @@ def _refuse_beyond_limits(kinds: tuple[Any, ...], value: Any, where: str) -> Non
     name = where.rpartition(".")[2].partition("[")[0]
     usual = LIMITS[float if float in numeric else int]
     low, high = LIMITS.get(name) or LIMITS.get(name.rpartition("_")[2], usual)
+    if where.partition(".")[0] in MEASURED:
+        low, high = 0, sys.float_info.max
     if not low <= value <= high:
         raise ConfigError(f"{where} is {value}; it must be from {low} to {high}")
 

@@ -284,9 +284,6 @@ def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
 
 def _refuse_impossible(result: Result) -> None:
     """Refuse values of the right type that no run writes; a digest is no signature."""
-    for name, value in result.timing.items():
-        if value < 0:
-            raise ValueError(f"timing.{name} is {value}; it must be a time, at least 0")
     if result.external.keys() - EXTERNAL or not all(isinstance(text, str) for text in result.external.values()):
         raise TypeError(f"external is {result.external!r}; it must be texts named {', '.join(EXTERNAL)}")
     views = (view for scores in result.scores.values() for view in scores.views)

@@ -41,6 +41,11 @@ class View:
     sphere_share: float = 1.0  # of all directions that a photograph beside panoramas shows; its weight among them
 
     @property
+    def weight(self) -> float:
+        """Return its weight among all views."""
+        return self.share * self.sphere_share
+
+    @property
     def camera(self) -> Camera:
         """Return the camera model, which gives the direction of each pixel."""
         return Panorama(self.width, self.height) if self.lens is None else self.lens

@@ -49,6 +49,11 @@ def test_what_is_written_is_read_again(result, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
 
 
+def test_what_was_measured_may_be_beyond_the_limits_of_settings(result, tmp_path):
+    slow = replace(result, timing={"render_ms_min": 2e6, "train_seconds": 1e9}, counts={"gaussians": 0})
+    assert results.read(results.write(slow, tmp_path)) == slow
+
+
 def test_the_file_is_standard_json(result, tmp_path):
     def refuse(name):
         raise AssertionError(f"{name} is not JSON")

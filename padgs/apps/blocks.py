@@ -26,6 +26,7 @@ import padgs.data
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions
 from padgs.data.depths import write_depths
+from padgs.data.formats.transforms import REDUCED
 from padgs.data.formats.writers import Content, write_transforms
 from padgs.data.masks import write_masks
 from padgs.files import draft_of
@@ -209,9 +210,11 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
                 (folder / link).symlink_to(os.path.relpath(image, (final / link).parent.resolve()))
             kept = torch.from_numpy(blocks.used[number][nearest])
             shares = {name: round(sphere_share(part), 4) for name, part in held.items()}
-            sizes = {view.name: {"width": view.width, "height": view.height} for view in views}
+            # Where the data set's format reduces wide images, the block does, and images have no size of their own.
+            sizes = {v.name: (None, None) if capture.width else (v.width, v.height) for v in views}
+            frames_of = {name: replace(frames[name], width=size[0], height=size[1]) for name, size in sizes.items()}
             content = Content(
-                frames=tuple(replace(frames[v.name], **sizes[v.name], share=shares.get(v.name, 1.0)) for v in views),
+                frames=tuple(replace(frames_of[v.name], share=shares.get(v.name, 1.0)) for v in views),
                 cloud=Cloud(points[kept], None if colors is None else colors[kept]),
                 tracks=None,
                 split={side: tuple(frames[v.name].name for v in part) for side, part in sides.items() if scene.test},
@@ -220,9 +223,10 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             within = {view.name: partial_mask(view, held[view.name]) for view in (*core, *margin) if view.name in held}
             write_depths(views, folder)
             write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
-            if (folder / "masks").is_dir():  # they hide most of a view, and are meant to
-                described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))
-                file.write_text(json.dumps(described | {"mask": "masks"}, ensure_ascii=False), encoding="utf-8")
+            masks_meant = {"mask": "masks"} if (folder / "masks").is_dir() else {}  # they hide most of a view
+            more = masks_meant | ({REDUCED: capture.width} if capture.width else {})
+            described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))
+            file.write_text(json.dumps(described | more, ensure_ascii=False), encoding="utf-8")
             block = {"number": number, "count": count, "format": format, "options": given, "regions": digest}
             block["source"] = os.path.relpath(source.resolve(), final.resolve())
             (folder / BLOCK).write_text(json.dumps(block, indent=1))

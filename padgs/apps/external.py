@@ -23,6 +23,7 @@ from padgs.checks import unknown
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.path_file import TRANSFORMS
 from padgs.data.formats.transforms import transforms_file
+from padgs.data.perturb import StressOptions
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import STABILITY, Render, frame_times, score
 from padgs.files import DAMAGE, open_image
@@ -97,7 +98,8 @@ def config_of(data: str, render: RenderConfig | None = None, device: str = "auto
         config = load_run(data, device="cpu").config
         protocols = {name: rules for name, rules in config.protocols.items() if name != STABILITY} or usual
         config = replace(config, method=METHOD, options=ExternalOptions(), protocols=protocols, labels=Labels())
-        config = replace(config, train=TrainConfig(), budget=BudgetOptions(), init=None, variant="", seed=0)
+        usual_run = {"train": TrainConfig(), "budget": BudgetOptions(), "stress": StressOptions()}
+        config = replace(config, **usual_run, init=None, variant="", seed=0)
     return replace(config, render=render or RenderConfig(), run=replace(config.run, device=device))
 
 
@@ -188,6 +190,8 @@ def open_model(
     if not is_splat_file(path):
         if transform or rays != "exact":
             raise ValueError(f"{path} is a run, whose renderer and world are known; leave out --rays and --transform")
+        if Path(path).is_file():
+            raise ValueError(f"{path} is no {', '.join(SPLATS)}, and no folder of a run; give one of these")
         return replace(load_run(path, data_path=data, device=device), opened_with=options_of(data, rays, transform))
     config = None if data is None else config_of(data, device=device)
     run = ExternalRun.open(Path(path), config, rays, transform, device)

@@ -25,14 +25,22 @@ Render = Callable[[View], Rendering]
 
 
 def score(
-    render: Render, scene: Scene, protocols: Mapping[str, Protocol], save_image: OnView | None
+    render: Render,
+    scene: Scene,
+    protocols: Mapping[str, Protocol],
+    save_image: OnView | None,
+    *,
+    calibrates: bool = False,
 ) -> dict[str, Scores]:
-    """Return the scores of the test views under each protocol; images are saved under the first one."""
+    """Return the scores of the test views under each protocol; images are saved under the first one.
+
+    Where training `calibrates`, its views have other poses, exposures or cameras than renders have: no marks of these.
+    """
     scores: dict[str, Scores] = {}
     for name, protocol in protocols.items():
         on_view = None if scores else save_image
         if name == STABILITY:
-            scores[name] = _stability(render, scene, protocol, on_view)
+            scores[name] = _stability(render, scene, protocol, on_view, calibrates)
         elif protocol.solid_angle and any(view.load_depth and not view.depth_is_relative for view in scene.test):
             scores[name] = evaluate(render, scene.test, protocol, on_view=on_view, extra=partial(_depth, protocol))
         else:
@@ -46,7 +54,7 @@ def _depth(protocol: Protocol, view: View, rendering: Rendering) -> Metrics:
     return depth_scores(view, rendering, mask)
 
 
-def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
+def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView | None, calibrates: bool) -> Scores:
     """Return image metrics, diagnostics, and WS-PSNR of one colour, after fitting colours, and of training views."""
 
     def more(view: View, rendering: Rendering) -> Metrics:
@@ -59,11 +67,12 @@ def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView
         if (blurred := oracle(image, truth, mask)) is not None:
             marks["pole_gap_oracle"] = pole_gap(blurred, truth, mask)
         marks = {"pole_gap_oracle": None, **{name: finite_or_none(mark) for name, mark in marks.items()}}
-        return {**marks, **diagnose(render, view, rendering, mask)}
+        marks |= diagnose(render, view, rendering, mask)
+        return marks | {"yaw_error": None} if calibrates else marks  # a learned camera map does not turn with the view
 
     scores = evaluate(render, scene.test, protocol, on_view=on_view, extra=more)
     training = scene.train[:: max(1, len(scene.train) // len(scene.test))]
-    ws_psnr = evaluate(render, training, protocol).metrics.get("ws_psnr")
+    ws_psnr = None if calibrates else evaluate(render, training, protocol).metrics.get("ws_psnr")
     return replace(scores, metrics={**scores.metrics, "ws_psnr_training": ws_psnr})
 
 

@@ -115,7 +115,7 @@ def _refuse_replaced_settings(choices: Mapping[str, object]) -> None:
     """Refuse render=... or train=... where the method has such settings of its own, of which one would be lost."""
     for group in {"render", "train"} & {*choices}:
         method, chosen = str(choices["method"]), choices[group]
-        if (brought := _settings_of(method, group)) not in (None, chosen):
+        if _settings_of(method, group) not in (None, chosen):
             file = root() / "conf" / group / f"{chosen}.yaml"
             keys = "".join(f" {group}.{key}={value}" for key, value in _table(file).items()) if file.exists() else ""
             instead = f"; instead of it set{keys}" if keys else "; leave it out"
@@ -125,7 +125,7 @@ def _refuse_replaced_settings(choices: Mapping[str, object]) -> None:
 
 
 def _settings_of(method: str, group: str) -> str | None:
-    """Return the choice of `render` or `train` that a method, or a file in `conf/method`, brings; None if it has none."""
+    """Return the choice of `render` or `train` that a method, or a file in `conf/method`, brings; None without one."""
     path = root() / "conf" / "method" / f"{method}.yaml"
     if not path.exists():
         return method if group in dict(method_choices(method)) else None

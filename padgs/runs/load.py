@@ -160,10 +160,12 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     store = RunStore(Path(folder))
     settings = store.path / results.CONFIG_NAME
     if not settings.is_file() or not store.has_checkpoint:
-        raise RunFolderError(
-            f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}; give the folder of one run, as "
-            "padgs-run names it at its end"
-        )
+        found = f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}"
+        if store.path.is_file():
+            found = f"{folder} is a file"
+        elif (store.path / results.FILE_NAME).is_file() and not settings.is_file():
+            found = f"{folder} has the scores of another program's model, which is opened by its own file"
+        raise RunFolderError(f"{found}; give the folder of one run, as padgs-run names it at its end")
     try:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
         run = {"configuration": config_hash(values)}  # the data are not read

@@ -201,7 +201,7 @@ def scored(config: RunConfig, scene: Scene, store: RunStore, result: Result, met
     """Return the result of a trained method with its frame times and scores."""
     save_image = store.save_image if config.run.pictures else None
     timing = result.timing | frame_times(method.render, scene)
-    scores = score(method.render, scene, config.protocols, save_image)
+    scores = score(method.render, scene, config.protocols, save_image, calibrates=method.calibrates)
     return judge(replace(result, timing=timing, scores=scores), scene, result.iterations_done)
 
 
@@ -351,6 +351,6 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
             )
         method = build_method(config)
         store.resume(method, scene.points.device)
-        scores = {**result.scores, **score(method.render, scene, unscored, None)}
+        scores = {**result.scores, **score(method.render, scene, unscored, None, calibrates=method.calibrates)}
         complete = judge(replace(complete, scores=scores), scene, result.iterations_done)
     return result if complete == result else store.finish(complete)

@@ -182,13 +182,16 @@ def validation_split(views: Sequence[View]) -> tuple[int, ...]:
 
 @torch.no_grad()
 def quality(render: Callable[[View], Rendering], views: Sequence[View]) -> float:
-    """Return the mean WS-PSNR of views, dB, at most 100; plain PSNR for perspective views."""
+    """Return the mean WS-PSNR of views, dB, at most 100; plain PSNR for perspective views; a Failure if it is NaN."""
     total = 0.0
     for view in views:
         image = render(view).image.clamp(0, 1)
         error = (image - image_of(view, image.device)).square().mean(-1)
         weight = even_weight(view, image.device).expand_as(error)
-        total -= 10 * math.log10(max(MIN_ERROR, ((error * weight).sum() / weight.sum()).item()))
+        mean = ((error * weight).sum() / weight.sum()).item()
+        if not math.isfinite(mean):
+            raise Failure("nan", f"the render of validation view {view.name} is not finite")
+        total -= 10 * math.log10(max(MIN_ERROR, mean))
     return total / len(views)
 
 

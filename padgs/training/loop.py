@@ -194,7 +194,7 @@ class Trainer:
         self.corrections.load_state_dict(state.under(VIEWS))
         self._optimizer.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
-        for name in self.PROGRESS:
+        for name in {*self.PROGRESS} - {"schedule"}:  # that of this budget
             setattr(self, name, state.values[name])
         for name in ("monitor", "early_stopping"):
             getattr(self, f"_{name}").state = copy.deepcopy(state.values[name])

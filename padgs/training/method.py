@@ -102,8 +102,11 @@ class Method(ABC):
         self._trainer.began = self._trainer.spent
         if self._warm_start_state is not None:
             stored, own = self._warm_start_state.under(VIEWS), self._trainer.corrections.state_dict()
-            fitting = {name: of for name, of in stored.items() if name in own and of.shape == own[name].shape}
-            self._trainer.corrections.load_state_dict(fitting, strict=False)
+            other = {
+                name.partition(".")[0] for name in stored if stored[name].shape != own.get(name, stored[name]).shape
+            }
+            whole = {name: of for name, of in stored.items() if name in own and name.partition(".")[0] not in other}
+            self._trainer.corrections.load_state_dict(whole, strict=False)
         if self._loaded_state is not None:
             self._trainer.load_state(self._loaded_state)
             self._loaded_state = None
@@ -115,7 +118,8 @@ class Method(ABC):
     def warm_start(self, state: State) -> None:
         """Let `fit` begin with the model of another training on this scene instead of the point cloud.
 
-        Schedule, optimizer and statistics begin anew; view corrections are taken over if both trainings learn them.
+        Schedule, optimizer and statistics begin anew; view corrections are taken over if both trainings learn them, a
+        camera map at the same image size.
         """
         self._warm_start_state = state
 
@@ -202,7 +206,7 @@ class Method(ABC):
         """Refuse a budget that this method cannot train within on any scene; subclasses add checks."""
         if budget.gaussians is not None and not self.HAS_GAUSSIANS:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but {self._name} has no Gaussians; leave it out")
-        if budget.stop == "auto" and self._views_learn:
+        if budget.stop == "auto" and self.calibrates:
             raise ValueError(
                 "budget.stop is auto, which measures validation views, but exposures or cameras are learned here, and "
                 "validation views have none; set it to end"
@@ -213,7 +217,7 @@ class Method(ABC):
         if not self.HAS_GAUSSIANS:
             why = "no Gaussians to prune, so it has no smallest model"
             raise ValueError(f"{self._name} has {why}; take a method with Gaussians")
-        if self._views_learn:
+        if self.calibrates:
             raise ValueError(
                 "the search for the smallest model compares renders with photographs, but exposures or cameras are "
                 "learned here; take a method that does not calibrate, with train.exposures=given and train.poses=given"
@@ -238,7 +242,7 @@ class Method(ABC):
                 ) from error
 
     @property
-    def _views_learn(self) -> bool:
+    def calibrates(self) -> bool:
         """True if exposures, poses or a lens are learned; held-out views have none then."""
         options = self.train_options
         return not options.exposures == options.poses == options.lens == GIVEN

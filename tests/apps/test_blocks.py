@@ -1,5 +1,6 @@
 """A capture of two rooms as two blocks, trained one by one and merged."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from padgs.apps.blocks import bisect, merge
 from padgs.cli.commands import app
 from padgs.data.assemble import assemble
 from padgs.data.capture import Capture, Cloud, DataOptions, Frame, Tracks
+from padgs.data.formats.transforms import REDUCED
 from padgs.data.formats.writers import Content, write_transforms
 from padgs.data.images import save_png
 from padgs.multirun.composition import composing, configuration
@@ -114,6 +116,19 @@ def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
     assert alone.test == [[], []] and sum(map(len, alone.core)) == 20
     tests = [view.name for scene in loaded for view in scene.test]
     assert sorted(tests) == sorted(view.name for view in whole.test)
+
+
+def test_blocks_of_a_format_that_reduces_wide_images_are_reduced(source, tmp_path):
+    folder = shutil.copytree(source, tmp_path / "rooms")
+    described = json.loads((folder / "transforms.json").read_text())
+    for frame in described["frames"]:
+        del frame["w"], frame["h"]
+    (folder / "transforms.json").write_text(json.dumps(described | {REDUCED: 16}))
+    assert CliRunner().invoke(app, ["split", str(folder), "--blocks", "2"]).exit_code == 0
+    for part in (tmp_path / "rooms-blocks").glob("rooms-block-*"):
+        scene = padgs.data.load(part)
+        assert all(view.width == 16 and view.mask().shape == (8, 16) for view in scene.train)
+        assert "used as they are" not in " ".join(scene.notes)
 
 
 def test_blocks_below_a_linked_folder_have_their_images_and_depth_maps(source, tmp_path):

@@ -24,6 +24,7 @@ from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
 from padgs.apps.frame_check import _closest_points, _worlds, as_numbers, check_frame, read_transform
 from padgs.cli.commands import app
+from padgs.data.perturb import StressOptions
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
 from padgs.evaluation.protocols import PROTOCOLS
@@ -76,6 +77,9 @@ def test_a_run_that_was_only_stressed_lends_its_data_and_not_its_protocol(run, m
     config = replace(opened.config, protocols={"stability": PROTOCOLS["stability"]})
     monkeypatch.setattr(external, "load_run", lambda *_, **__: replace(opened, config=config))
     assert external.config_of(str(run)).protocols.keys() == {"paper", "sphere"}
+    stressed = replace(opened.config, stress=StressOptions("pose_noise", 3), seed=1)
+    monkeypatch.setattr(external, "load_run", lambda *_, **__: replace(opened, config=stressed))
+    assert external.config_of(str(run)).stress == StressOptions()
 
 
 def test_suffixes_may_be_capitals(splats, tmp_path):
@@ -287,6 +291,8 @@ def test_wrong_input_is_refused(run, splats, tmp_path):
         ),
         (("score", tmp_path, "--data", run, "--rays", "ewa"), "--transform and --rays belong to Gaussians"),
         (("render", run, "--rays", "ewa"), "leave out --rays and --transform"),
+        (("render", tmp_path / "a.obj"), "and no folder of a run; give one of these"),
+        (("export", splats), "is a file; give the folder of one run"),
     ):
         code, output = padgs_command(*arguments)
         assert code == 1 and message in output and "Traceback" not in output, output

@@ -42,7 +42,7 @@ TOO_LATE = {
     "method=cubemap_3dgs train.poses=learned": "cut from one photograph would learn its own; leave it at given",
     "method=egonerf render.projection=ray": "egonerf casts rays",
     "method=spags render=default": "render=default is not for method=spags, which has own settings of render; leave it",
-    "method=op43dgs render=released": "own settings of render; instead of it set render.near=0.2 render.near_unit=world",
+    "method=op43dgs render=released": "own settings of render; instead of it set render.near=0.2",
     "method=spags_tuned train=uniform": "own settings of train; instead of it set train.weight=uniform",
     "method=padgs_release train=default": "which has own settings of train; leave it out",
     "train=uniform": "train=uniform is not for method=padgs_plus",

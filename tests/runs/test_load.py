@@ -196,6 +196,9 @@ def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, mon
 def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
     with pytest.raises(RunFolderError, match="has no config.yaml; give the folder of one run"):
         padgs.load_run(tmp_path)
+    shutil.copy(folder / "result.json", tmp_path)
+    with pytest.raises(RunFolderError, match="scores of another program's model, which is opened by its own file"):
+        padgs.load_run(tmp_path)
     shutil.copy(folder / "config.yaml", tmp_path)
     with pytest.raises(RunFolderError, match="has no checkpoint"):
         padgs.load_run(tmp_path)

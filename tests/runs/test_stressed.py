@@ -58,6 +58,11 @@ def test_a_run_says_what_it_is_stressed_by_and_has_marks_that_show_harm(run):
     assert run("stress.condition=few_views", "stress.level=1")[0] == made  # found again
 
 
+def test_methods_that_learn_cameras_have_no_marks_of_training_views(run):
+    marks = run("train.exposures=learned", "train.iterations=10")[0].scores["stability"].metrics
+    assert marks["ws_psnr_training"] is None and marks["yaw_error"] is None and marks["depth_error"] > 0
+
+
 def test_rows_that_do_not_count_count_in_no_mark(run, tmp_path):
     marks = [
         run(f"protocol.stability.bottom_crop={crop}", "train.iterations=60", f"run.folder={tmp_path}/{crop}")[0]

@@ -13,7 +13,7 @@ from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering
 from padgs.scene import View
-from padgs.training.health import FADE, EarlyStopping, quality, validation_split
+from padgs.training.health import FADE, EarlyStopping, Failure, quality, validation_split
 from padgs.training.loop import Trainer
 from padgs.training.options import Budget
 from padgs.training.targets import TrainingViews
@@ -152,7 +152,13 @@ def test_too_few_views_for_a_validation_split_are_refused():
         Budget(10, stop="never")
 
 
-@pytest.mark.parametrize("name", ["egonerf", "sc_omnigs"])
+def test_a_render_that_is_not_a_number_ends_the_run(scene):
+    gray, nothing = torch.full((HEIGHT, WIDTH, 3), torch.nan), torch.zeros(HEIGHT, WIDTH)
+    with pytest.raises(Failure, match="the render of validation view 00 is not finite"):
+        quality(lambda view: Rendering(gray, nothing, nothing, nothing[0] > 0), tiny_scene().train[:1])
+
+
+@pytest.mark.parametrize("name", ["egonerf", "sc_omnigs", "crops_3dgs"])
 def test_methods_without_validation_views_refuse_early_stopping(name, scene):
     with pytest.raises(ValueError, match="budget.stop is auto.*set it to end"):
         lookup(METHODS, name, "method")().fit(scene, Budget(10, stop="auto"))

@@ -60,13 +60,14 @@ def export_run(
         splats = model.baked()
         if (world := run.method.world) is not None:
             splats = transform_splats(splats, world.inverse())
-        notes.append("Gaussians as trained")
-        if distillation_steps != DISTILLATION_STEPS:
-            notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
+        as_trained = "Gaussians as trained"
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             # Square pixels, also after training with several samples: for viewers with one, this is nearer to the run.
             splats, smooth = smoothed(splats, cameras_of(run.scene.train), config.low_pass), False
-            notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
+            as_trained += ", including the 3D smoothing filter"
+        notes.append(as_trained)
+        if distillation_steps != DISTILLATION_STEPS:
+            notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
     elif isinstance(model, AnchorModel):
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)

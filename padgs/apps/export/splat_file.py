@@ -101,7 +101,7 @@ def _convert(source: Path, target: Path, *more: str) -> None:
         os.replace(made, target)
 
 
-def check_suffix(path: Path) -> None:
+def check_suffix(path: Path, doing: str = "writing") -> None:
     """Raise a ValueError early for an unknown suffix, or if the converter that it needs is not installed."""
     if not path.name.lower().endswith((".ply", *CONVERTED)):
         raise ValueError(f"{path} has an unknown format; known: .ply, {', '.join(CONVERTED)}")
@@ -109,8 +109,8 @@ def check_suffix(path: Path) -> None:
         raise ValueError(f"{path} has no name before its suffix; name the file, such as {path.with_name('room.ply')}")
     if path.name.lower().endswith(CONVERTED) and shutil.which(CONVERTER) is None:
         raise ValueError(
-            f"writing {path.name} needs {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
-            "or write a .ply, which most viewers read"
+            f"{doing} {path.name} needs {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
+            "or take a .ply, which most programs read and write"
         )
 
 
@@ -121,7 +121,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     that the converter is not installed.
     """
     if path.name.lower().endswith(CONVERTED):
-        check_suffix(path)
+        check_suffix(path, "reading")
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "splats.ply"
             if path.name.lower().endswith(".ply"):

@@ -113,6 +113,8 @@ class RunRenderer:
         method = method.with_renderer(method.render_config)  # a copy, which can then only render
         model = method.model
         positions = model.anchors.positions if isinstance(model, AnchorModel) else model.splats.means
+        if (world := method.world) is not None:  # the box is in the given world
+            positions = world.inverse()(positions.double())
         low, high = (positions.new_tensor(corner) for corner in crop)
         model.keep(((positions >= low) & (positions <= high)).all(-1))
         return method

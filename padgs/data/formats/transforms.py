@@ -17,6 +17,7 @@ from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.splits import is_inside
 
 FILE = "transforms.json"
+REDUCED = "reduce_to"  # `Capture.width`, as `padgs split` states it
 SIDES = {"train": ("transforms_train.json",), "test": ("transforms_test.json", "transforms_val.json")}
 MODELS = ("EQUIRECTANGULAR", "SPHERICAL")
 _PLY = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pcd.ply", "scene.ply")
@@ -69,7 +70,9 @@ def read(path: Path, options: DataOptions) -> Capture:
         notes = (f"{unused[1].name} is not used: {unused[0].name} has the test views",)
     if any(frame.get("depth_file_path") for meta in metas.values() for frame in meta["frames"].entries()):
         notes += (f"depth: depth_file_path is not read; {HOW}",)
-    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant, notes=notes)
+    width = reduced.whole() if (reduced := first.get(REDUCED)) else None
+    stated = split or None
+    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, stated, meant, width, notes=notes)
 
 
 def transforms_file(path: str | None, format: str) -> Path | None:

@@ -58,10 +58,10 @@ def write_transforms(content: Content, folder: Path) -> None:
     """Write `transforms.json` and sparse_pc.ply."""
     frames = []
     for frame in content.frames:
-        width, height = _size(frame)
         pose = torch.linalg.inv(frame.cam_from_world)
         pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_OPENGL
-        frame_size = {"w": width, "h": height} | ({"share": frame.share} if frame.share != 1 else {})
+        frame_size = {} if frame.width is None else {"w": frame.width, "h": frame.height}
+        frame_size |= {"share": frame.share} if frame.share != 1 else {}
         frames.append({"file_path": f"images/{frame.name}", **frame_size, "transform_matrix": pose.tolist()})
     meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
     if content.cloud is not None:

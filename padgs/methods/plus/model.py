@@ -65,8 +65,8 @@ class PlusModel(SplatModel):
             one = self._rendered(gaussians, view, self._config.options(scale)).image
             several = self._rendered(gaussians, view, self._long_config.options(scale)).image
             target, weight = image_of(view, one.device), even_weight(view, one.device)
-            change += view.sphere_share * squared_error(several, one, weight).item()
-            error += view.sphere_share * squared_error(target, one, weight).item()
+            change += view.weight * squared_error(several, one, weight).item()
+            error += view.weight * squared_error(target, one, weight).item()
         return change >= self.options.supersampling_share * error
 
     def degree_at(self, iteration: int) -> int:

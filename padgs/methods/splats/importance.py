@@ -37,7 +37,7 @@ def importance_scores(model: Prunable, views: Sequence[View]) -> Importance:
     if not views:
         raise ValueError("no views to score by; give at least one")
     rows, change, contributes = next(iter(model.counts().values())), None, None
-    total = sum(view.sphere_share for view in views)
+    total = sum(view.weight for view in views)
     for view in views:
         parts = model.parts(view)
         target, weight = image_of(view, parts.slots.device), even_weight(view, parts.slots.device)
@@ -45,7 +45,7 @@ def importance_scores(model: Prunable, views: Sequence[View]) -> Importance:
         if change is None or contributes is None:
             change = torch.zeros(rows * parts.each, dtype=torch.float64, device=target.device)
             contributes = torch.zeros(rows * parts.each, dtype=torch.bool, device=target.device)
-        change[parts.slots] += removals.change * view.sphere_share / total
+        change[parts.slots] += removals.change * view.weight / total
         contributes[parts.slots] |= removals.peak > 0
     assert change is not None and contributes is not None
     return Importance(change.view(rows, -1).sum(-1), int(contributes.sum()))

@@ -12,6 +12,7 @@ from padgs.apps.viewer.controls import FilmControls
 from padgs.apps.viewer.renders import RunRenderer, ViewOptions, captioned, level, side_by_side, with_legend
 from padgs.data.formats.path_file import read_path
 from padgs.evaluation.images import to_uint8
+from padgs.geometry.similarity import Similarity
 from padgs.scene import View, move_origin
 
 
@@ -66,6 +67,18 @@ def test_cropped_gaussians_are_not_rendered(renderer, anchors):
         all_of_it = shown.render(ViewOptions("panorama", crop=((-1e6,) * 3, (1e6,) * 3)), view.cam_from_world, 32, 16)
         assert np.array_equal(all_of_it, shown.render(ViewOptions("panorama"), view.cam_from_world, 32, 16))
         assert shown.run.method.render(view).image.max() > 0, "the run itself is left as it is"
+
+
+def test_a_box_is_in_the_given_world_also_after_poses_were_learned(renderer, monkeypatch):
+    run = replace(renderer.run, method=renderer.run.method.with_renderer(renderer.run.method.render_config))
+    means = run.method.model.splats.means.detach()
+    low, high = means.double().quantile(0.3, dim=0), means.double().quantile(0.7, dim=0)
+    inside = int(((means >= low) & (means <= high)).all(-1).sum())
+    world = Similarity(0.5, translation=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    monkeypatch.setattr(type(run.method), "world", world)
+    box = tuple(tuple(world.inverse()(corner[None])[0].tolist()) for corner in (low - 1e-4, high + 1e-4))
+    shown = RunRenderer(run)._method_for(run.scene.train[0].camera, box)
+    assert len(shown.model.splats) == inside > 0
 
 
 def test_side_by_side():

@@ -1,9 +1,11 @@
 """Number of rows that hand-made importance scores require, and the pixels that count in a score."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from support.tiny_scene import tiny_scene
 
 from padgs.geometry.camera import perspective
 from padgs.methods.splats.importance import (
@@ -36,6 +38,16 @@ def test_rows_are_removed_until_their_changes_add_up_to_the_psnr(psnr, count):
 
 def test_a_tenth_stays_even_if_all_rows_replace_each_other():
     assert count_for_psnr(scored(*[0.0] * 1000), 44.0) == MIN_KEPT_SHARE * 1000
+
+
+def test_views_score_by_their_weight_in_training():
+    scene = tiny_scene()
+    splats = Splats.from_scene(scene, generator=torch.Generator())
+    model = SplatModel(splats, SplatOptions(), RenderConfig("ray"), extent=1.0, iterations=10)
+    first, second = scene.train[:2]
+    alone = [importance_scores(model, (view,)).change for view in (first, second)]
+    both = importance_scores(model, (first, replace(second, share=0.5, sphere_share=0.5))).change
+    torch.testing.assert_close(both, (alone[0] + 0.25 * alone[1]) / 1.25)
 
 
 def test_all_pixels_of_a_perspective_view_weigh_the_same():
