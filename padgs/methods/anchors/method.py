@@ -200,9 +200,10 @@ class PaDGSMethod(Method):
         anchors = PaDGS.from_scene(scene, self.options, seed=self.seed)
         is_new = self._warm_start_state is None and self._loaded_state is None
         if is_new and isinstance(self._gaussians, int) and self._gaussians < len(anchors):
+            voxels = "voxel_pixels" if self.options.voxel_size == "auto" else "voxel_size"
             raise ValueError(
                 f"budget.gaussians is {self._gaussians}, but training starts with {len(anchors)} anchors; increase it "
-                "or method.voxel_pixels"
+                f"or method.{voxels}"
             )
         return self._model_of(anchors, extent, iterations)
 

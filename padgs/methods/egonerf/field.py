@@ -16,6 +16,7 @@ from padgs.methods.egonerf import grids
 from padgs.methods.egonerf.grids import Factors, GridPosition, PlaneLines
 from padgs.render import Rendering
 from padgs.scene import Scene, View
+from padgs.training.initial_points import refuse_unusable
 
 CLOUD_SHARE = 0.95  # of the points; those behind may be outliers
 MAX_ROOM_REACH = 4.0  # scene units
@@ -297,6 +298,7 @@ def surroundings_of(scene: Scene) -> str:
 
 def cloud_reach(scene: Scene) -> float:
     """Return the distance that `CLOUD_SHARE` of the points are within, scene units, median over training cameras."""
+    refuse_unusable(scene.points, "the constants of EgoNeRF")
     points = scene.points[:: max(1, len(scene.points) // 20_000)].double()
     distances = [(points - view.center.to(points)).norm(dim=-1).quantile(CLOUD_SHARE) for view in scene.train]
     return torch.stack(distances).median().item() / scene.scale

@@ -290,6 +290,12 @@ def test_outliers_do_not_change_the_surroundings():
         assert surroundings_of(replace(scene, train=(still,), points=points)) == kind
 
 
+@pytest.mark.parametrize(("points", "why"), [(torch.zeros(0, 3), "is empty"), (torch.full((1, 3), torch.nan), "nan")])
+def test_unusable_points_are_refused(points, why):
+    with pytest.raises(ValueError, match=why):
+        EgoNeRF.from_scene(replace(tiny_scene(), points=points), EgoNeRFOptions())
+
+
 def test_given_constants_override_those_of_the_surroundings():
     small: dict[str, Any] = {"radial_nodes": 4, "polar_nodes": 4, "azimuth_nodes": 4, "environment_height": 4}
     chosen = EgoNeRF.from_scene(tiny_scene(), EgoNeRFOptions(**small))
