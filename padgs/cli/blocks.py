@@ -31,7 +31,8 @@ def split(
         lines = write(Path(source), destination, blocks, format, options)
     for line in lines:
         show(line)
-    names = ",".join(line.partition(": ")[0] for line in lines)
+    folders = (line.partition(": ")[0] for line in lines)
+    names = ",".join(f'"{folder}"' if "," in folder else folder for folder in folders)
     command = shlex.join(["padgs-run", "-m", f"data.path={names}", *(["data.split=all"] if split == "all" else [])])
     show(f"next: {command}, then padgs merge with the runs")
 
