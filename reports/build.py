@@ -9,7 +9,7 @@ from typing import Any
 from pandas import DataFrame, Series
 
 from padgs.reports import REPORTS, frame, methods, published
-from padgs.reports.conditions import Reason, as_published, footnotes, refuse_mixture, unranked, unranked_notes
+from padgs.reports.conditions import as_published, footnotes, refuse_mixture, unranked, unranked_notes
 from padgs.reports.frame import by_conditions, by_place, grouped, law, without_data
 from padgs.reports.measures import Measure, quantity
 from padgs.reports.published import AVERAGE, Place, Published
@@ -40,9 +40,8 @@ class _Builder:
         self.name, self.spec, self.request = name, SPECS[name], run_set.request
         self.runs = self._select(run_set)
         self.protocols = self.spec.protocols or (self.request.protocol,)
-        beside = self.spec.paper and self.request.protocol == published.PROTOCOL
-        beside = beside and any(place.published for place in self.runs["place"])
-        self.paper = published.load() if beside else {}
+        is_beside = self.spec.paper and self.request.protocol == published.PROTOCOL
+        self.paper = published.load() if is_beside and any(place.published for place in self.runs["place"]) else {}
         known = self.runs.columns[self.runs.notna().any()]
         measures = self.spec.measures(self.request.protocol)
         if self.request.metrics and not self.spec.pivot:
@@ -51,7 +50,7 @@ class _Builder:
             measures = [own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics]
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
-        self.unranked: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
+        self.unranked: list[Mapping[str, tuple[str, str]]] = []  # presets that are not ranked, of each block
 
     def build(self) -> Table:
         blocks, single, notes = list[Block](), list[Block](), list[str]()
@@ -124,13 +123,11 @@ class _Builder:
         for method, titles in (TITLES[spec.titles] or {"": self._titles(place, runs)}).items():
             if spec.difference and not runs[spec.rows].isin(titles).any():
                 continue
-            not_ranked = self.unranked[-1] if self.unranked else ()
             apart_in = spec.rows if spec.rows == "preset" else "place"  # rows of a variant have titles of their own
             cells = {}
             for value, words in titles.items():
                 own = one_setting(runs.loc[runs[spec.rows] == value], f"{title}, {words}", apart_in)
-                ours = over_seeds(own, self.measures)
-                cells[value] = unrank(ours) if value in not_ranked else ours
+                cells[value] = over_seeds(own, self.measures)
             heading = f"{methods.name(method)}, {title}" if spec.difference else title
             where = (self.spec.paper.get(place.dataset, 0), place)
             theirs = {value: published.row(self.paper, *where, self._method(value)) for value in titles}
@@ -162,17 +159,13 @@ class _Builder:
         return {preset: methods.title(preset) if preset in run else methods.name(preset) for preset in presets}
 
     def _rows(
-        self,
-        titles: Mapping[str, str],
-        cells: Mapping[str, Sequence[Cell]],
-        theirs: Mapping[str, Mapping[str, Published]],
-        runs: DataFrame,
+        self, titles: dict[str, str], cells: dict[str, list[Cell]], theirs: dict[str, dict], runs: DataFrame
     ) -> tuple[Row, ...]:
         of, rows = {value: runs.loc[runs[self.spec.rows] == value] for value in cells}, []
+        not_ranked = self.unranked[-1] if self.unranked else ()
         for value, ours in cells.items():
-            comparable = as_published(of[value])
-            row: list[Cell] = []
-            for measure, cell in zip(self.measures, ours, strict=True):
+            comparable, row = as_published(of[value]), list[Cell]()
+            for measure, cell in zip(self.measures, unrank(ours) if value in not_ranked else ours, strict=True):
                 row.append(cell)
                 if self.paper and measure.published:
                     row.append(_published(theirs[value].get(measure.published)))
@@ -203,19 +196,16 @@ class _Builder:
         for preset, words in titles.items():
             alike = settings.loc[settings["preset"] == preset]
             refuse_differences(alike, f"{title or heading}, {words}", "preset")
-            ours = over_scenes(alike, places, self.measures)
-            cells[preset] = unrank(ours) if preset in self.unranked[-1] else ours
+            cells[preset] = over_scenes(alike, places, self.measures)
             if title and self.paper:
-                chosen = (places[0].dataset, [place.scene for place in places], self._method(preset))
-                theirs[preset] = published.mean_row(self.paper, self.spec.paper[places[0].dataset], *chosen)
+                table = self.spec.paper[places[0].dataset]
+                theirs[preset] = published.mean_row(self.paper, table, places, self._method(preset))
         return [Block(heading, self._rows(titles, cells, {**dict.fromkeys(titles, {}), **theirs}, runs))]
 
     def _scenes_down(self, dataset: str, places: Sequence[Place]) -> Iterator[Block]:
         """Yield a block for each measure in the layout of the paper: scenes down, methods across."""
         own = {place: self.runs.loc[self.runs["place"] == place] for place in places}
-        titles: dict[str, str] = {}
-        for place, runs in own.items():
-            titles |= self._titles(place, runs)
+        titles = {of: words for place, runs in own.items() for of, words in self._titles(place, runs).items()}
         blocks = {place: next(iter(self._blocks(place.title, place, runs))) for place, runs in own.items()}
         columns = self._columns()
         for measure in self.measures:
@@ -247,11 +237,9 @@ class _Builder:
 
     def _each_run(self, runs: DataFrame) -> Iterator[Row]:
         for one in settings(runs):
-            own = zip(*(one.runs[of] for of in ("seed", "run", "ok", "status")), strict=True)
-            for (seed, run, ok, status), values in zip(own, numbers_of(one.runs, self.measures).tolist(), strict=True):
+            for number, (seed, run) in enumerate(zip(one.runs["seed"], one.runs["run"], strict=True)):
                 title = ", ".join([one.preset, *one.apart, f"seed {seed}", run.rpartition("_")[2]])
-                failed = "" if ok else status
-                yield Row(title, tuple(mean_cell([] if math.isnan(value) else [value], failed) for value in values))
+                yield Row(title, tuple(over_seeds(one.runs.iloc[[number]], self.measures)))
 
 
 class _Pivot(_Builder):

@@ -246,8 +246,7 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame, where: str) -
     seeds = len(first), len(rivals[rival])
     tested = min(seeds) >= LEAST_SEEDS and math.isfinite(advantage)  # inf: an exact render
     differs = tested and differ(mean_cell([*first]), mean_cell([*rivals[rival]]), claim.measure.column)
-    found = {"rival": rival, "advantage": advantage, "differs": differs, "tested": tested}
-    return {**found, "seeds": f"{seeds[0]}, {seeds[1]}"}
+    return dict(rival=rival, advantage=advantage, differs=differs, tested=tested, seeds=f"{seeds[0]}, {seeds[1]}")
 
 
 def _numbers(claim: Claim, runs: DataFrame) -> Any:

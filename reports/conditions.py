@@ -1,7 +1,6 @@
 """Conditions under which numbers were made: shared within a block, named below a table, and decisive for ranking."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 
 import pandas as pd
 from pandas import DataFrame
@@ -41,14 +40,6 @@ NOTHING_TO_CORRECT = (
 )
 
 
-@dataclass(frozen=True)
-class Reason:
-    """Reason why a preset is not ranked in a block."""
-
-    why: str
-    numbers: str = ""
-
-
 def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: Iterable[str] = CONDITIONS) -> None:
     """Raise Mixture if runs of one block differ in a condition, unless the request allows it."""
     shared = (of for what in conditions for of in (RULES if what == "protocol" else (what,)))
@@ -57,13 +48,10 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
         if len(values) > 1:
             named = zip(values, runs["run"][values.index], strict=True)
             difference = f"{where}: results differ in {what} ({'; '.join(f'{value} in {run}' for value, run in named)})"
-            advice = "choose with --where, or compare them anyway with --mix"
-            raise Mixture(difference, advice, runs, [what])
+            raise Mixture(difference, "choose with --where, or compare them anyway with --mix", runs, [what])
 
 
-def sheets(
-    runs: DataFrame, request: Request, kind: str, shared: Iterable[str] = CONDITIONS
-) -> Iterator[tuple[str, str, DataFrame]]:
+def sheets(runs: DataFrame, request: Request, kind: str, shared: Iterable[str]) -> Iterator[tuple[str, str, DataFrame]]:
     """Yield file name, title and runs of each scene, resolution and length; `shared`: see `refuse_mixture`."""
     for where, own in by_conditions(runs, "resolution", "length").items():
         refuse_mixture(own, request, where, shared)
@@ -74,11 +62,8 @@ def sheets(
 def as_published(runs: DataFrame) -> bool:
     """Return whether runs have the size and the length of the paper, without which numbers cannot be compared."""
     kinds = {*zip(runs["method"], runs["resolution"], runs["length"], strict=True)}
-    return bool(kinds) and all(
-        int(size.partition("x")[0]) >= PUBLISHED_WIDTH
-        and length == f"{PUBLISHED_LENGTHS.get(method, PUBLISHED_ITERATIONS)} iterations"
-        for method, size, length in kinds
-    )
+    is_long = all(length == f"{PUBLISHED_LENGTHS.get(of, PUBLISHED_ITERATIONS)} iterations" for of, _, length in kinds)
+    return bool(kinds) and is_long and all(int(size.partition("x")[0]) >= PUBLISHED_WIDTH for _, size, _ in kinds)
 
 
 def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
@@ -118,26 +103,26 @@ def _values(runs: DataFrame, what: str) -> pd.Series:
     return runs[what].dropna() if what in runs else pd.Series(dtype=object)
 
 
-def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]:
-    """Return preset -> reason of those not to be ranked, after equally many images (`equal_images`) or equal time."""
-    found: dict[str, Reason] = {}
+def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, tuple[str, str]]:
+    """Return preset -> (reason, numbers) of those not to be ranked, after equal images (`equal_images`) or time."""
+    found: dict[str, tuple[str, str]] = {}
     seen = runs.loc[runs["ok"]].groupby("preset")["images"].mean()
     for preset, images in seen[seen < LEAST_SHARE * seen.max()].items() if equal_images else ():
-        found[str(preset)] = Reason(FEWER_IMAGES, f"{images:.0f} of {seen.max():.0f} images")
+        found[str(preset)] = FEWER_IMAGES, f"{images:.0f} of {seen.max():.0f} images"
     for method, keys in CALIBRATES.items():
         if (own := runs.loc[runs["method"] == method]).empty:
             continue
         errors = own.reindex(columns=[f"{CONFIG}data.generator.{key}" for key in keys]).fillna(0).astype(bool)
         corrected = errors.any(axis=1) & (own["dataset"] == "synthetic")  # other data ignore the generator's keys
-        found |= dict.fromkeys(own.loc[~corrected, "preset"], Reason(NOTHING_TO_CORRECT))
+        found |= dict.fromkeys(own.loc[~corrected, "preset"], (NOTHING_TO_CORRECT, ""))
     return found
 
 
-def unranked_notes(blocks: Iterable[Mapping[str, Reason]]) -> list[str]:
+def unranked_notes(blocks: Iterable[Mapping[str, tuple[str, str]]]) -> list[str]:
     """Return a sentence for each reason, with the titles of all presets concerned."""
     concerned: dict[str, dict[str, dict[str, None]]] = {}
-    for preset, reason in (pair for block in blocks for pair in block.items()):
-        concerned.setdefault(reason.why, {}).setdefault(title(preset), {})[reason.numbers] = None
+    for preset, (why, numbers) in (pair for block in blocks for pair in block.items()):
+        concerned.setdefault(why, {}).setdefault(title(preset), {})[numbers] = None
     found = []
     for why, titles in sorted(concerned.items()):
         named = [f"{name} ({', '.join(numbers)})" if any(numbers) else name for name, numbers in titles.items()]

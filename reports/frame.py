@@ -42,8 +42,7 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     facts, rules = (_columns(rows, object, names) for rows, names in zip(parts[:2], (FACTS, ()), strict=True))
     facts["log"], facts["renders"] = [run.log for run in runs], [run.renders for run in runs]
     metrics, numbers = _columns(parts[2], float), _columns(parts[3], float, NUMBERS)
-    last = [run.log.get("polar_transmittance", ())[-1:] for run in runs]
-    numbers["polar_transmittance"] = [value[0] if value else math.nan for value in last]
+    numbers["polar_transmittance"] = [[math.nan, *run.log.get("polar_transmittance", ())][-1] for run in runs]
     numbers["train_hours"], numbers["fps"] = numbers["train_seconds"] / 3600, 1000 / numbers["frame_ms"]
     config = _columns(parts[4], object).add_prefix(CONFIG)
     made = pd.concat([facts.astype({"ok": bool}), rules, metrics, numbers, config], axis=1)
@@ -174,8 +173,7 @@ def without_data(runs: DataFrame) -> DataFrame:
 
 
 def _hardware(result: Result) -> str:
-    known = result.machine
-    count = known.get("cores")
+    known, count = result.machine, result.machine.get("cores")
     where = known.get("gpu") or f"{count} core{'s' * (count != 1)} of {known.get('cpu')}"
     return f"{where}, torch {known.get('torch')}"
 

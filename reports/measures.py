@@ -29,26 +29,24 @@ class Measure:
     difference: bool = False  # whether ours minus the paper's means anything
 
 
-COSTS = {
-    measure.name: measure
-    for measure in (
-        Measure("iterations_done", Column("iterations", 0)),
-        Measure("images", Column("images seen", 0)),
-        Measure("train_hours", Column("training h", 4, False, group="training h"), "train_hours"),
-        Measure("train_seconds", Column("training s", 0, False)),
-        Measure("cpu_seconds", Column("CPU s", 0, False)),
-        Measure("fps", Column("FPS", 2, True, group="FPS"), "fps"),
-        Measure("frame_ms", Column("ms per frame", 1, False)),
-        Measure("anchors", Column("anchors", 0)),
-        Measure("start", Column("started from", 0)),
-        Measure("gaussians", Column("Gaussians", 0)),
-        Measure("minimal_count", Column("minimal count", 0, False)),
-        Measure("megabytes", Column("model MB", 1, False)),
-        Measure("polar_transmittance", Column("transmittance above 85°", 3, False)),
-        Measure("peak_gigabytes", Column("peak GB", 2, False)),
-        Measure("peak_gpu_gigabytes", Column("peak GPU GB", 2, False)),
-    )
-}
+_COSTS = (
+    Measure("iterations_done", Column("iterations", 0)),
+    Measure("images", Column("images seen", 0)),
+    Measure("train_hours", Column("training h", 4, False, group="training h"), "train_hours"),
+    Measure("train_seconds", Column("training s", 0, False)),
+    Measure("cpu_seconds", Column("CPU s", 0, False)),
+    Measure("fps", Column("FPS", 2, True, group="FPS"), "fps"),
+    Measure("frame_ms", Column("ms per frame", 1, False)),
+    Measure("anchors", Column("anchors", 0)),
+    Measure("start", Column("started from", 0)),
+    Measure("gaussians", Column("Gaussians", 0)),
+    Measure("minimal_count", Column("minimal count", 0, False)),
+    Measure("megabytes", Column("model MB", 1, False)),
+    Measure("polar_transmittance", Column("transmittance above 85°", 3, False)),
+    Measure("peak_gigabytes", Column("peak GB", 2, False)),
+    Measure("peak_gpu_gigabytes", Column("peak GPU GB", 2, False)),
+)
+COSTS = {measure.name: measure for measure in _COSTS}
 
 
 def costs(*names: str, **changes: Any) -> tuple[Measure, ...]:
@@ -62,11 +60,9 @@ def metric(protocol: str, name: str, group: str = "", **changes: Any) -> Measure
     >>> metric("sphere", "ws_psnr_pole").column.heading, metric("paper", "lpips_vgg_01").column.heading
     ('WS-PSNR pole ↑', 'LPIPS VGG [0, 1] ↓')
     """
-    if name in DEPTH:
-        return Measure(f"{protocol}/{name}", replace(DEPTH[name], group=group, **changes))
     title = " ".join(TITLES.get(word, word) for word in name.split("_")).replace("WS ", "WS-")
-    column = Column(title, 2 if "psnr" in name else 3, higher_is_better(name), group=group)
-    return Measure(f"{protocol}/{name}", replace(column, **changes))
+    column = DEPTH.get(name) or Column(title, 2 if "psnr" in name else 3, higher_is_better(name))
+    return Measure(f"{protocol}/{name}", replace(column, group=group, **changes))
 
 
 def metrics(protocol: str) -> tuple[Measure, ...]:
@@ -83,6 +79,5 @@ def quantity(name: str, protocol: str, runs: DataFrame) -> Measure:
     """Return a metric that runs have under a protocol, or a cost, by its name; a ReportError lists the known ones."""
     known = [column.removeprefix(f"{protocol}/") for column in runs if column.startswith(f"{protocol}/")]
     if name not in (*known, *COSTS):
-        names = ", ".join((*known, *COSTS))
-        raise ReportError(f"unknown metric {name!r}; known under protocol {protocol}: {names}")
+        raise ReportError(f"unknown metric {name!r}; known under protocol {protocol}: {', '.join((*known, *COSTS))}")
     return COSTS[name] if name in COSTS else metric(protocol, name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,12 +120,10 @@ class Place:
 def load() -> Mapping[Key, Published]:
     """Return all published numbers; a FileNotFoundError says that the file is missing from the package."""
     with FILE.open(newline="") as file:
-        return {
-            Key(
-                int(row["table"]), row["dataset"], SCENES.get(row["scene"], row["scene"]), row["method"], row["metric"]
-            ): Published(float(row["value"]) if row["value"] else None, row["status"])
-            for row in csv.DictReader(file)
-        }
+        rows = [{**row, "scene": SCENES.get(row["scene"], row["scene"])} for row in csv.DictReader(file)]
+    keys = (Key(int(of["table"]), of["dataset"], of["scene"], of["method"], of["metric"]) for of in rows)
+    numbers = (Published(float(of["value"]) if of["value"] else None, of["status"]) for of in rows)
+    return dict(zip(keys, numbers, strict=True))
 
 
 def row(numbers: Mapping[Key, Published], table: int, place: Place, method: str) -> dict[str, Published]:
@@ -134,13 +132,12 @@ def row(numbers: Mapping[Key, Published], table: int, place: Place, method: str)
     return {k.metric: n for k, n in numbers.items() if (k.table, k.dataset, k.scene, k.method) == where}
 
 
-def mean_row(
-    numbers: Mapping[Key, Published], table: int, dataset: str, chosen: Sequence[str], method: str
-) -> dict[str, Published]:
+def mean_row(numbers: Mapping[Key, Published], table: int, places: list[Place], method: str) -> dict[str, Published]:
     """Return metric -> mean of a method over some scenes of a data set, where the paper has a number for each."""
-    if set(chosen) == set(scenes(numbers, DATASETS[dataset])):
+    dataset = places[0].dataset
+    if {place.scene for place in places} == {*scenes(numbers, DATASETS[dataset])}:
         return row(numbers, table, Place(dataset, AVERAGE), method)
-    rows = [row(numbers, table, Place(dataset, scene), method) for scene in chosen]
+    rows = [row(numbers, table, place, method) for place in places]
     known = [{name: number.value for name, number in own.items() if number.value is not None} for own in rows]
     shared = set.intersection(*map(set, known))
     return {name: Published(sum(own[name] for own in known) / len(known), "ok") for name in shared}

@@ -171,20 +171,17 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
     presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
     blocks = []
     for title, those in found.items():
-        row = _row_maker(presets, those)
+        row = partial(_row, presets, those)
         scores = [row(of.replace("_", " "), lambda one, of=of: Cell(getattr(one, of))) for of in SCORES]
         rows = [row(f"unstressed: {of}", partial(_unstressed, columns)) for of, columns in UNSTRESSED.items()]
         known = [made for made in rows if any(cell.value is not None for cell in made.cells)]
         kept = [row(f"{of[0]} {of[1]}", lambda one, of=of: one.robustness.get(of, Cell())) for of in all_stress(those)]
         conditions = dict.fromkeys(condition for condition, _ in all_stress(those))
         breaks = [row(of, lambda one, of=of: Cell(status=str(one.breakdown(of) or ""))) for of in conditions]
-        blocks += [
-            Block(title, (*scores, *known)),
-            Block(f"Robustness, {title}", tuple(kept)),
-            Block(f"Breaks at level, {title}", tuple(breaks)),
-        ]
+        blocks += [Block(title, (*scores, *known)), Block(f"Robustness, {title}", tuple(kept))]
+        blocks.append(Block(f"Breaks at level, {title}", tuple(breaks)))
     columns = tuple(Column(methods.title(preset), 2) for preset in presets)
-    notes = (*footnotes(_references(run_set, found), PROTOCOL), *STABILITY_NOTES)
+    notes = (*_footnotes(run_set, found), *STABILITY_NOTES)
     table = Table("stability", "Robustness of methods under stress", "Condition", columns, tuple(blocks), notes)
     return [table, *(heat_map(*one) for one in found.items())]
 
@@ -199,7 +196,7 @@ def limits(run_set: RunSet) -> Table:
     presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
     blocks = []
     for title, those in found.items():
-        row, rows = _row_maker(presets, those), []
+        row, rows = partial(_row, presets, those), []
         for condition, level in all_stress(those):
             limit = LIMITS.get(condition, {})
             metric, levels = limit.get("metric", "ws_psnr"), limit.get("allowed", ())
@@ -209,9 +206,8 @@ def limits(run_set: RunSet) -> Table:
             rows.append(Row(words, (Cell(allowed), *lost.cells)))
         blocks.append(Block(title, tuple(rows)))
     columns = (Column("allowed", 2), *(Column(methods.title(preset), 2) for preset in presets))
-    notes = (*footnotes(_references(run_set, found), PROTOCOL), *LIMITS_NOTES)
-    title = "Losses of methods under stress, and their limits"
-    return Table("limits", title, "Condition", columns, tuple(blocks), notes)
+    notes = (*_footnotes(run_set, found), *LIMITS_NOTES)
+    return Table("limits", "Losses of methods under stress, and their limits", "Condition", columns, (*blocks,), notes)
 
 
 @styled
@@ -257,34 +253,25 @@ def heat_map(title: str, stressed: Sequence[StressedMethod]) -> Chart:
     if left_out := [methods.title(one.preset) for one in stressed if one not in shown]:
         notes.append(f"Not run under all conditions, and so left out: {', '.join(left_out)}.")
     first = stressed[0].reference.iloc[0]
-    name = file_name(f"{first['place'].stem}-{first['resolution']}")
-    return Chart(f"stability-{name}", title, made, tuple(notes))
+    return Chart(file_name(f"stability-{first['place'].stem}-{first['resolution']}"), title, made, tuple(notes))
 
 
-def _row_maker(presets: Sequence[str], stressed: Sequence[StressedMethod]) -> Callable[..., Row]:
-    by_preset = {one.preset: one for one in stressed}
-
-    def row(title: str, cell: Callable[[StressedMethod], Cell]) -> Row:
-        return Row(title, tuple(cell(by_preset[preset]) if preset in by_preset else Cell() for preset in presets))
-
-    return row
+def _row(presets: Sequence[str], stressed: Sequence[StressedMethod], title: str, cell: Callable[..., Cell]) -> Row:
+    cells = {one.preset: cell(one) for one in stressed}
+    return Row(title, tuple(cells.get(preset, Cell()) for preset in presets))
 
 
-def _references(run_set: RunSet, found: Mapping[str, Sequence[StressedMethod]]) -> dict[str, DataFrame]:
-    return {
-        f"{title}, without stress": run_set.runs.loc[sorted(i for one in those for i in one.reference.index)]
-        for title, those in found.items()
-    }
+def _footnotes(run_set: RunSet, found: Mapping[str, Sequence[StressedMethod]]) -> list[str]:
+    rows = {title: sorted(i for one in those for i in one.reference.index) for title, those in found.items()}
+    return footnotes({f"{title}, without stress": run_set.runs.loc[own] for title, own in rows.items()}, PROTOCOL)
 
 
 def _stressed_method(runs: DataFrame, preset: str, where: str) -> StressedMethod | None:
     own, where = runs.loc[runs["preset"] == preset], f"{where}, {methods.title(preset)}"
     refuse_differences(own.drop(columns=[CONDITION, LEVEL]), where)
     reference, stressed = own.loc[own[CONDITION].isna() & own["ok"]], own.loc[own[CONDITION].notna()]
-    cells = {
-        (condition, int(level)): one_setting(alike, f"{where}, {condition} {level}")
-        for (condition, level), alike in grouped(stressed, CONDITION, LEVEL)
-    }
+    groups = grouped(stressed, CONDITION, LEVEL)
+    cells = {(name, int(level)): one_setting(own, f"{where}, {name} {level}") for (name, level), own in groups}
     return StressedMethod(preset, cells, one_setting(reference, where)) if cells and len(reference) else None
 
 

@@ -177,10 +177,9 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
         runs = runs.loc[[any(map(request.matches, of)) for of in runs["experiments"]]]
     where = dict(request.where)
-    stated = {name: names_of([where.pop(name, "")]) for name in ("method", "scene")}
-    chosen = [("preset", "method", request.methods), ("scene", "dataset", request.scenes)]
-    chosen += [("preset", "method", stated["method"]), ("scene", "dataset", stated["scene"])]
-    for *columns, patterns in chosen if len(every) else ():
+    patterns_of = (request.methods, request.scenes, *(names_of([where.pop(name, "")]) for name in ("method", "scene")))
+    chosen = zip((["preset", "method"], ["scene", "dataset"]) * 2, patterns_of, strict=True)
+    for columns, patterns in chosen if len(every) else ():
         if patterns:
             own = [_is_one_of(names, patterns) for names in runs[columns].itertuples(index=False)]
             if lost := _unmatched(every[columns], patterns) or ([] if any(own) else patterns):
@@ -196,10 +195,8 @@ def select(runs: DataFrame, request: Request) -> DataFrame:
             raise ReportError(f"unknown key {key!r}; known in run {first['run']}: {', '.join(keys)}")
         runs = runs.loc[[_is_value(stored, value) for stored in runs[column]]]
         if runs.empty:
-            values = ", ".join(
-                sorted({"null" if stored != stored or stored is None else str(stored) for stored in every[column]})
-            )
-            raise ReportError(f"no run has {key}={value}; runs have {values}")
+            known = sorted({"null" if of != of or of is None else str(of) for of in every[column]})
+            raise ReportError(f"no run has {key}={value}; runs have {', '.join(known)}")
     return runs
 
 
@@ -233,10 +230,8 @@ def settings(runs: DataFrame) -> list[Setting]:
         own = runs.loc[runs["preset"] == preset]
         alike = (differing_keys(runs_of) for _, runs_of in grouped(own, "variant"))
         keys = [key for key in dict.fromkeys(chain.from_iterable(alike)) if key != "variant"]
-        made = [
-            Setting(preset, variant, {key: group[CONFIG + key].iloc[0] for key in keys}, group)
-            for (variant, _), group in grouped(own, "variant", "setting")
-        ]
+        groups = grouped(own, "variant", "setting")
+        made = [Setting(preset, of, {key: its[CONFIG + key].iloc[0] for key in keys}, its) for (of, _), its in groups]
         found += sorted(made, key=lambda setting: (setting.variant, [sort_key(v) for v in setting.changed.values()]))
     return found
 

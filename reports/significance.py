@@ -60,12 +60,8 @@ def over_scenes(runs: DataFrame, scenes: Sequence[Place], measures: Sequence[Mea
 
 def numbers_of(runs: DataFrame, measures: Sequence[Measure]) -> NDArray:
     """Return the numbers [run, measure]; NaN where a run failed or has none."""
-    found = np.full((len(runs), len(measures)), np.nan)
-    for index, measure in enumerate(measures):
-        if measure.name in runs:
-            found[:, index] = runs[measure.name]
-    found[~runs["ok"].to_numpy()] = np.nan
-    return found
+    found = runs.reindex(columns=[measure.name for measure in measures]).to_numpy(float)
+    return np.where(runs["ok"].to_numpy()[:, None], found, np.nan)
 
 
 def mean_cell(values: Sequence[float], failed: str = "") -> Cell:

@@ -18,11 +18,7 @@ from padgs.reports.table import Block, Column, Row, Table
 from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, SMALLEST_STATED
 
 STATED = f"{SMALLEST_STATED:g}"  # dB, as results name losses
-PANELS = (
-    ("blended", "Gaussians blended", 1.0),
-    ("bytes", "model, MB", 1e-6),
-    ("frame_ms", "minimal ms per frame", 1.0),
-)
+PANELS = (("blended", "Gaussians blended", 1), ("bytes", "model, MB", 1e-6), ("frame_ms", "minimal ms per frame", 1))
 LOSSES = tuple(f"{loss:g}" for loss in SMALLEST_PICTURED)  # dB, marked in the chart by a ring and a square
 IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic

@@ -64,25 +64,20 @@ class Spec:
         return found
 
 
-def _variants(table: str, chosen: Callable[[str], bool] = lambda name: True) -> dict[str, str]:
+def _variants(table: str) -> dict[str, str]:
     """Return variant -> title of a table in conf/variants."""
     folder = Path(__file__).resolve().parent.parent / "conf" / "variants"  # beside reports, installed or not
     rows = yaml.safe_load((folder / f"{table}.yaml").read_text("utf-8"))
-    return {name: row["title"] for name, row in rows.items() if chosen(name)}
+    return {name: row["title"] for name, row in rows.items()}
 
 
-def _is_rung(variant: str) -> bool:
-    return variant[0] == "a" and variant[1].isdigit()
-
-
-BUDGET, TAU = f"{CONFIG}budget.gaussians", f"{CONFIG}method.tau"
-RATES = f"{CONFIG}train.learning_rates"
-PARTS = _variants("ablation", lambda name: not _is_rung(name))
-RUNGS = _variants("ablation", _is_rung)
-WITHOUT = _variants("plus_ablation")
+BUDGET, TAU, RATES = (CONFIG + key for key in ("budget.gaussians", "method.tau", "train.learning_rates"))
+ABLATION, WITHOUT, DEVIATION = map(_variants, ("ablation", "plus_ablation", "deviation"))
+RUNGS = {name: title for name, title in ABLATION.items() if name[0] == "a" and name[1].isdigit()}
+PARTS = {name: title for name, title in ABLATION.items() if name not in RUNGS}
 DEVIATIONS = {  # method -> variant -> title
-    method: _variants("deviation", lambda name, method=method: methods.method_of(name) == method)
-    for method in methods.ordered(map(methods.method_of, _variants("deviation")))
+    method: {name: title for name, title in DEVIATION.items() if methods.method_of(name) == method}
+    for method in methods.ordered(map(methods.method_of, DEVIATION))
 }
 VOXELS = {"padgs_small": "one anchor per 3 px", "padgs": "one anchor per 0.1 px"}  # ours for the paper's 0.001
 CROSSED = {f"{preset} {tau}": f"{title}, τ = {tau:g}" for preset, title in VOXELS.items() for tau in (0.0, 0.9)}

@@ -57,8 +57,7 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
         for path in sorted(found, key=lambda file: (file.parent.is_symlink(), len(file.parent.name), file)):
             distinct.setdefault(path.resolve(), path)
         loads = {str(path): partial(_from_folder, path) for path in distinct.values()}
-    runs: dict[str, Run] = {}
-    errors: list[ResultError] = []
+    runs, errors = dict[str, Run](), list[ResultError]()
     for where, load in loads.items():
         try:
             run = load(where)

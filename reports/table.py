@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any
 
 MISSING = "–"
@@ -111,14 +112,10 @@ class Table:
     def single(self, block: Block, *, drop_empty: bool = False) -> Table:
         """Return one block as a table without empty optional columns, or with `drop_empty` without any empty column."""
         every = block.own_columns or self.columns
-        kept = [
-            index
-            for index, column in enumerate(every)
-            if not (column.optional or drop_empty) or any(row.cells[index] != Cell() for row in block.rows)
-        ]
-        rows = tuple(replace(row, cells=tuple(row.cells[index] for index in kept)) for row in block.rows)
-        columns = tuple(every[index] for index in kept)
-        corner = "Scene" if block.across else self.corner
+        known = [any(row.cells[index] != Cell() for row in block.rows) for index in range(len(every))]
+        kept = [is_known or not (of.optional or drop_empty) for is_known, of in zip(known, every, strict=True)]
+        rows = tuple(replace(row, cells=tuple(compress(row.cells, kept))) for row in block.rows)
+        columns, corner = tuple(compress(every, kept)), "Scene" if block.across else self.corner
         return replace(self, corner=corner, columns=columns, blocks=(replace(block, rows=rows, own_columns=()),))
 
 

@@ -69,14 +69,9 @@ def rendered(template: str, **values: Any) -> str:
     """Return the text of a template in this folder; HTML is escaped, and the filter `md` escapes Markdown."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).resolve().parent),
-        autoescape=select_autoescape(["html.j2"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    loader, escape = FileSystemLoader(Path(__file__).resolve().parent), select_autoescape(["html.j2"])
+    lines: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    environment = Environment(loader=loader, autoescape=escape, undefined=StrictUndefined, **lines)
     environment.filters["md"] = markdown_text
     return environment.get_template(template).render(**values)
 
@@ -88,15 +83,13 @@ def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
         write_atomically(folder / file, content)
 
 
-def rows_of(table: Table) -> list[tuple[str, list[tuple[str, str | None]]]]:
-    """Return title, and (text, rank) of each cell, of the rows of a table with one block."""
+def rows_of(table: Table) -> Iterator[tuple[str, list[tuple[str, str | None]]]]:
+    """Yield title, and (text, rank) of each cell, of the rows of a table with one block."""
     (block,) = table.blocks
     ranks = marks(block, table.columns)
-    found = []
     for number, row in enumerate(block.rows):
         title, *texts = row.texts(table.columns)
-        found.append((title, [(text, rank.get(number)) for text, rank in zip(texts, ranks, strict=True)]))
-    return found
+        yield title, [(text, rank.get(number)) for text, rank in zip(texts, ranks, strict=True)]
 
 
 def markdown(table: Table) -> str:
@@ -104,10 +97,8 @@ def markdown(table: Table) -> str:
     parts = [f"## {markdown_text(table.title)}"]
     for block in table.blocks:
         single = table.single(block)
-        lines = [
-            [table.corner, *(markdown_text(column.heading) for column in single.columns)],
-            ["---", *["---:"] * len(single.columns)],
-        ]
+        lines = [[table.corner, *(markdown_text(column.heading) for column in single.columns)]]
+        lines.append(["---", *["---:"] * len(single.columns)])
         for title, cells in rows_of(single):
             marked = (MARKDOWN_MARKS.get(rank, "<ins>{}</ins>").format(markdown_text(text)) for text, rank in cells)
             lines.append([markdown_text(title), *marked])
@@ -124,17 +115,11 @@ def latex(table: Table) -> str:
         single = table.single(block)
         wide = len(single.columns) > COLUMNS_OF_A_PAGE
         label = f"tab:{table.name}" + (f"-{number + 1}" if number else "")
-        lines += [
-            *([r"\begin{landscape}"] if wide else []),
-            r"\begin{table}",
-            r"  \centering",
-            f"  \\caption{{{latex_text(table.title)}: {latex_text(block.title)}}}\\label{{{label}}}",
-            r"  \begin{adjustbox}{max totalsize={\linewidth}{0.9\textheight}}",
-            f"  \\begin{{tabular}}{{l{'r' * len(single.columns)}}}",
-            r"    \toprule",
-            *_headings(single),
-            r"    \midrule",
-        ]
+        caption = f"  \\caption{{{latex_text(table.title)}: {latex_text(block.title)}}}\\label{{{label}}}"
+        lines += [*([r"\begin{landscape}"] if wide else []), r"\begin{table}", r"  \centering", caption]
+        lines.append(r"  \begin{adjustbox}{max totalsize={\linewidth}{0.9\textheight}}")
+        lines += [f"  \\begin{{tabular}}{{l{'r' * len(single.columns)}}}", r"    \toprule"]
+        lines += [*_headings(single), r"    \midrule"]
         for title, cells in rows_of(single):
             shown = (LATEX_COMMANDS.get(rank, r"\underline{{{}}}").format(_number(text)) for text, rank in cells)
             lines.append(_line([latex_text(title), *shown]))

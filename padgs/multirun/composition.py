@@ -105,10 +105,8 @@ def _refuse_changed_rows(values: Mapping[str, Any], choices: Mapping[str, object
             group, _, key = setting.partition(".")
             found = values.get(group, {}).get(key) if key else choices.get(group)
             if found != value:
-                raise ConfigError(
-                    f"+{path.stem}={chosen} means {setting}={value}, but {setting}={found} was set besides; leave out "
-                    "one of the two"
-                )
+                means = f"+{path.stem}={chosen} means {setting}={value}"
+                raise ConfigError(f"{means}, but {setting}={found} was set besides; leave out one of the two")
 
 
 def _refuse_replaced_settings(choices: Mapping[str, object]) -> None:
@@ -118,10 +116,8 @@ def _refuse_replaced_settings(choices: Mapping[str, object]) -> None:
         if _settings_of(method, group) not in (None, chosen):
             file = root() / "conf" / group / f"{chosen}.yaml"
             keys = "".join(f" {group}.{key}={value}" for key, value in _table(file).items()) if file.exists() else ""
-            instead = f"; instead of it set{keys}" if keys else "; leave it out"
-            raise ConfigError(
-                f"{group}={chosen} is not for method={method}, which has own settings of {group}{instead}"
-            )
+            why = f"{group}={chosen} is not for method={method}, which has own settings of {group}"
+            raise ConfigError(f"{why}; {f'instead of it set{keys}' if keys else 'leave it out'}")
 
 
 def _settings_of(method: str, group: str) -> str | None:

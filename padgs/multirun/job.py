@@ -83,10 +83,9 @@ class Board:
 
     def read(self, job: int) -> JobState:
         """Return the state of a job; waiting, if it has written none."""
-        try:
+        with suppress(OSError, ValueError, TypeError):
             return JobState(**json.loads(self._path(job).read_bytes()))
-        except (OSError, ValueError, TypeError):
-            return JobState()
+        return JobState()
 
     def output(self, job: int) -> TextIO:
         """Open the file for the screen output of a job in a process of its own; the caller closes it."""

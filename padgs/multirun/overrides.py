@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def lenient(arguments: Sequence[str]) -> list[str]:
     >>> lenient(["scale=cpu", "scene_set=bar_cpu"])
     ['+scale=cpu', 'scene_set=bar_cpu']
     """
-    groups = _groups() | {"hydra"}
+    groups = _groups()
     has_experiment = any(argument.startswith("+experiment=") for argument in arguments)
 
     def forced(argument: str) -> str:
@@ -76,8 +77,7 @@ def quoted(arguments: Sequence[str]) -> list[str]:
     several = is_multirun(arguments)
 
     def in_quotes(argument: str) -> str:
-        found = FILES.fullmatch(argument)
-        if found is None:
+        if not (found := FILES.fullmatch(argument)):
             return argument
         key, value = found.groups()
         is_list = several and not GRAMMAR.fullmatch(value)
@@ -88,9 +88,7 @@ def quoted(arguments: Sequence[str]) -> list[str]:
 
 
 def _quoted(name: str) -> str:
-    if GRAMMAR.fullmatch(name):
-        return name
-    return QuotedString(os.path.expanduser(name), Quote.double).with_quotes()
+    return name if GRAMMAR.fullmatch(name) else QuotedString(os.path.expanduser(name), Quote.double).with_quotes()
 
 
 def is_multirun(arguments: Sequence[str]) -> bool:
@@ -162,12 +160,10 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
     """
     for name in (argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")):
         module, extra = PLUGINS.get(name, ("padgs", ""))
-        try:
-            found = importlib.util.find_spec(module) is not None
-        except ModuleNotFoundError:  # there is no plugin at all
-            found = False
-        if not found:
-            return f"launcher={name} needs {module.partition('.')[2]}: {install_command(extra)}"
+        with suppress(ModuleNotFoundError):  # there is no plugin at all
+            if importlib.util.find_spec(module):
+                continue
+        return f"launcher={name} needs {module.partition('.')[2]}: {install_command(extra)}"
     return None
 
 

@@ -4,6 +4,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from padgs.runs.interrupt import ending_by_signals
 
@@ -17,8 +18,6 @@ def main() -> None:
 
         with exit_on_errors():
             _answer(arguments)
-            from pathlib import Path
-
             from rich.console import Console
 
             from padgs.multirun.composition import composing, configuration, multirun

@@ -158,8 +158,7 @@ class Multirun:
     def close(self) -> Counter[str]:
         """Print how the jobs ended; delete the board unless it explains a crash or jobs still need it."""
         for index, state in self.states.items():
-            result = self._result(state.run) if state.status == Status.ELSEWHERE else None
-            if result:  # the other process has finished it
+            if state.status == Status.ELSEWHERE and (result := self._result(state.run)):  # done by the other process
                 self._end(index, replace(state, status=result.status))
         self._say(self.line())
         self._show_table()
@@ -277,8 +276,7 @@ def titles(jobs: Sequence[Sequence[str]]) -> list[str]:
 def summary(status: str, result: Result | None) -> list[str]:
     """Return quality, size and time of a run, or why it has none."""
     if result is None or not result.ok:
-        reason = result.reason if result else ""
-        return [f"{status} ({reason})" if reason else status]
+        return [f"{status} ({result.reason})" if result and result.reason else status]
     psnr, size = psnr_of(result), [*result.counts.items()][:1]
     parts = ["ok" if psnr is None else f"{psnr:.2f} dB", *(f"{compact(count)} {name}" for name, count in size)]
     return [*parts, f"trained {duration(result.timing.get('train_seconds', 0))}"]

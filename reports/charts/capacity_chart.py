@@ -27,8 +27,7 @@ class Point:
     preset: str
     limit: int
     gaussians: float
-    quality: float
-    cell: Cell  # quality with its deviation over seeds
+    cell: Cell  # quality, with its deviation over seeds
 
 
 def charts(run_set: RunSet) -> list[Chart]:
@@ -50,7 +49,7 @@ def _points(runs: DataFrame, preset: str, where: str) -> list[Point]:
         alike = one_setting(runs.loc[runs[BUDGET] == limit], f"{where}, {limit} Gaussians", "preset")
         quality, count = over_seeds(alike, MEASURES)
         if quality.value is not None and count.value:
-            found.append(Point(preset, int(limit), count.value, quality.value, quality))
+            found.append(Point(preset, int(limit), count.value, quality))
     return found
 
 
@@ -59,11 +58,11 @@ def _chart(name: str, title: str, points: list[Point], notes: tuple[str, ...]) -
     made, axes = drawing.figure(1, 1, *SIZE)
     panel, labels = axes[0, 0], []
     set_axis(panel.xaxis, [point.gaussians for point in points], logarithmic=True)
-    set_axis(panel.yaxis, [point.quality for point in points])
+    set_axis(panel.yaxis, [point.cell.value for point in points])
     presets = list(dict.fromkeys(point.preset for point in points))
     for preset, mark in zip(presets, cycle(MARKERS), strict=False):  # presets of a method share a colour
         own = [point for point in points if point.preset == preset]
-        xs, ys = [point.gaussians for point in own], [point.quality for point in own]
+        xs, ys = [point.gaussians for point in own], [point.cell.value for point in own]
         look = {"color": color_of(preset, presets), "linewidth": 1.3, "elinewidth": 0.8}
         panel.errorbar(xs, ys, [point.cell.std or 0.0 for point in own], fmt=f"-{mark}", markersize=2 * RADIUS, **look)
         text = methods.short(methods.title(preset), preset)
@@ -72,7 +71,7 @@ def _chart(name: str, title: str, points: list[Point], notes: tuple[str, ...]) -
     panel.set_ylabel(f"{QUALITY.column.title}, dB ↑")
     what = f"{title}\nquality over the number of Gaussians, trained with each limit; bars: deviation over seeds"
     drawing.lay_out(made, what)
-    drawing.write_labels(panel, labels, [(point.gaussians, point.quality, RADIUS) for point in points])
+    drawing.write_labels(panel, labels, [(point.gaussians, point.cell.value, RADIUS) for point in points])
     rows = [{**vars(point), **point.cell.numbers} for point in points]
     numbers = DataFrame(rows, columns=["preset", "limit", "gaussians", *Cell().numbers], dtype=object)
     return Chart(name, what, made, notes, numbers)

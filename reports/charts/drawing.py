@@ -18,10 +18,7 @@ from padgs.reports.methods import METHODS, color, method_of
 P = ParamSpec("P")
 T = TypeVar("T")
 OTHERS = ("#44aa99", "#999933", "#882255")
-INK = "#1d2330"
-SOFT = "#5b6475"
-GRID = "#e3e6eb"
-PAPER = "#ffffff"
+INK, SOFT, GRID, PAPER = "#1d2330", "#5b6475", "#e3e6eb", "#ffffff"
 COLORS = (*(method["color"] for method in METHODS.values()), *OTHERS)
 ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
@@ -32,13 +29,10 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "font.size": 9,
     "font.family": "sans-serif",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
     "grid.color": GRID,
     "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "legend.frameon": False,
     "figure.facecolor": PAPER,
     "axes.facecolor": "none",
     **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),

@@ -96,8 +96,7 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
         own = runs.loc[[name in of for of in runs["experiments"]]]
         curves, drawn = [], {}
         for place, there in by_place(own).items():
-            parts = list(_curves(there, MAX_AD_HOC_KEYS if name == AD_HOC else None))
-            if not parts:
+            if not (parts := list(_curves(there, MAX_AD_HOC_KEYS if name == AD_HOC else None))):
                 continue
             refuse_mixture(there, request, f"{name}, {place.title}", OF_A_SWEEP)
             drawn[place.title] = there
@@ -121,7 +120,7 @@ def chart(sweep: Sweep) -> Chart:
     for index, (panel, measure) in enumerate(zip(axes.flat, sweep.measures, strict=False)):
         _set_axes(panel, sweep, index, measure)
         for number, curve in enumerate(sweep.curves):
-            _draw(panel, curve, index, measure, number)
+            _draw(panel, curve, index, number)
     for panel in axes.flat[len(sweep.measures) :]:
         panel.set_axis_off()
     made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
@@ -149,11 +148,10 @@ def _curves(runs: DataFrame, max_keys: int | None) -> Iterator[tuple[str, str, s
         keys = list(found[0].changed)
         if len(found) < 2 or (max_keys is not None and len(keys) > max_keys):
             continue
-        numeric = [key for key in keys if all(is_number(setting.changed[key]) for setting in found)]
-        if len(keys) > 2 or not numeric:
+        along = next((key for key in keys if all(is_number(setting.changed[key]) for setting in found)), None)
+        if len(keys) > 2 or along is None:
             yield preset, variant, "", [(", ".join(setting.words(keys)), setting) for setting in found]
             continue
-        along = numeric[0]
         others = [key for key in keys if key != along]
         by_fixed: dict[str, list[tuple[Any, Setting]]] = {}
         for setting in found:
@@ -166,8 +164,7 @@ def _curves(runs: DataFrame, max_keys: int | None) -> Iterator[tuple[str, str, s
 def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
     xs = [x for curve in sweep.curves for x, _ in curve.points]
     cells = [cells[index] for curve in sweep.curves for _, cells in curve.points]
-    ends = [c.value + sign * (c.std or 0.0) for c in cells if c.value is not None for sign in (-1, 1)]
-    set_axis(panel.yaxis, ends)
+    set_axis(panel.yaxis, [c.value + sign * (c.std or 0.0) for c in cells if c.value is not None for sign in (-1, 1)])
     panel.set_title(measure.column.heading, fontsize=9)
     panel.set_xlabel(sweep.key or "setting")
     if not all(isinstance(x, (int, float)) for x in xs):
@@ -178,7 +175,7 @@ def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
         panel.axvline(PAPER_CHOICES[sweep.key], color=SOFT, linestyle=":", linewidth=1)
 
 
-def _draw(panel: Any, curve: Curve, index: int, measure: Measure, number: int) -> None:
+def _draw(panel: Any, curve: Curve, index: int, number: int) -> None:
     color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
     cells = [(x, cells[index]) for x, cells in curve.points]
     there = [(x, c.value, c.std or 0.0) for x, c in cells if c.value is not None]

@@ -10,7 +10,7 @@ from pandas import DataFrame
 from padgs.reports import methods, published
 from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets
 from padgs.reports.frame import by_place, without_data
-from padgs.reports.measures import Measure, costs, metric
+from padgs.reports.measures import PROTOCOL_METRICS, Measure, costs, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, one_setting, settings
 from padgs.reports.significance import failure_notes, over_scenes
@@ -19,10 +19,7 @@ from padgs.results import file_name
 
 FEWEST = 3  # methods in a chart of equal time
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
-QUALITIES = (
-    *(metric("sphere", name) for name in ("ws_psnr", "ws_lpips_alex")),
-    *(metric("paper", name) for name in ("psnr", "lpips_vgg_01")),
-)
+QUALITIES = tuple(metric(of, PROTOCOL_METRICS[of][name]) for of in ("sphere", "paper") for name in ("psnr", "lpips"))
 
 
 @dataclass(frozen=True)
@@ -109,15 +106,13 @@ def equal_times(run_set: RunSet) -> list[TradeOff]:
     """
     runs, found = run_set.of_experiments("equal_time"), []
     shown = replace(run_set.request, protocol=_protocol(runs))
-    groups: dict[tuple[str, str, str], dict[Place, DataFrame]] = {}
+    groups: dict[tuple[str, ...], dict[Place, DataFrame]] = {}
     for name, title, own in sheets(runs.loc[runs["variant"] == ""], shown, "equal_time", OF_A_CHART):
-        first = own.iloc[0]
-        made = _trade_off("equal_time", {first["place"]: own}, shown, equal_images=False)
+        place, *kind = own.iloc[0][["place", "resolution", "length"]]
+        made = _trade_off("equal_time", {place: own}, shown, equal_images=False)
         if len({point.preset for point in made.points}) >= FEWEST:
             found.append(replace(made, name=name, title=title))
-            groups.setdefault((first["place"].seen, first["resolution"], first["length"]), {})[first["place"]] = (
-                without_data(own)
-            )
+            groups.setdefault((place.seen, *kind), {})[place] = without_data(own)
     means = []
     for (seen, size, length), group in groups.items():
         made = _trade_off("equal_time", group, shown, equal_images=False)
@@ -154,12 +149,9 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
         refuse_mixture(setting.runs, request, f"{name}, {setting.title}", OF_A_MEAN)
         for place, own in by_place(setting.runs).items():
             one_setting(own, f"{place.title}, {setting.title}")
-    found = [setting for setting in every if setting.runs["ok"].any()]
+    found = [setting for setting in every if setting.runs["ok"].any()]  # a setting that failed has no point
     finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]
-    if len(group) == 1:
-        finished = list(group)  # a setting that failed has no point
-    first = next(iter(group))
-    points = []
+    first, points = next(iter(group)), list[Point]()
     for setting in found if finished else ():
         cells = over_scenes(setting.runs, finished, measures)
         if any(cell.value is not None for cell in cells):

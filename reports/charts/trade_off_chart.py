@@ -17,7 +17,8 @@ from padgs.reports.conditions import unranked
 from padgs.reports.measures import COSTS
 from padgs.reports.selection import RunSet, Setting, settings
 
-FRAME_TIME = ("frame_ms", "time per frame", "ms")  # cost, words, unit
+Cost = tuple[str, str, str]  # name, words, unit
+FRAME_TIME = ("frame_ms", "time per frame", "ms")
 TRAINING_TIME, CPU_TIME = ("train_seconds", "training time", "s"), ("cpu_seconds", "training time on the CPU", "s")
 SIZE, TIME_SIZE = (5.3, 4.6), (10.6, 4.2)  # inches of a panel, and of a chart of quality over time
 AREA, SMALL_AREA = 90.0, 30.0  # points^2 of marks, and of those of releases
@@ -63,7 +64,7 @@ def equal_time_charts(run_set: RunSet) -> list[Chart]:
     return [chart(trade_off, (FRAME_TIME,)) for trade_off in equal_times(run_set)]
 
 
-def chart(trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()) -> Chart:
+def chart(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> Chart:
     """Return panels with a common axis of quality and a label at each mark, by default of training and of frame time.
 
     Axes show where methods differ (`drawing.window`); a note names the marks beyond. Releases are small rings, outside
@@ -75,9 +76,7 @@ def chart(trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()) -> Ch
 
 
 @styled
-def draw(
-    trade_off: TradeOff, shown: Sequence[tuple[str, str, str]] = ()
-) -> tuple[Any, list[tuple[Any, list[Mark], str, list[Any]]]]:
+def draw(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> tuple[Any, list[tuple[Any, list[Mark], str, list[Any]]]]:
     """Return the figure, and for each panel the axes, the marks, the unit of the cost and the labels."""
     quality = trade_off.quality
     shown = shown or (CPU_TIME if trade_off.on_cpu else TRAINING_TIME, FRAME_TIME)
@@ -167,21 +166,17 @@ def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]
     Runs without a complete log are left out, and settings without a run in a scene. Logs have wall time, which is
     scaled so that it ends with the run's CPU time where that is known.
     """
-    found, places = [], trade_off.runs["place"].unique()
+    found = []
     for setting in settings(trade_off.runs.loc[trade_off.runs["ok"]]):
         scales = (setting.runs["train_seconds"] / setting.runs["wall_seconds"]).fillna(1.0)
         logs = [*zip(setting.runs["place"], setting.runs["log"], scales, strict=True)]
         count = max(len(log["psnr"]) for _, log, _ in logs)  # others would cut the mean
-        of_scenes = [
-            [
-                (scale * np.array(log["seconds"]), log["psnr"])
-                for at, log, scale in logs
-                if at == place and len(log["psnr"]) == count
-            ]
-            for place in places
-        ]
-        if count and all(of_scenes):
-            seconds, psnr = np.mean([np.mean(of, axis=0) for of in of_scenes], axis=0).tolist()
+        of_scenes: dict[Any, list[Any]] = {place: [] for place in trade_off.runs["place"].unique()}
+        for place, log, scale in logs:
+            if len(log["psnr"]) == count:
+                of_scenes[place].append((scale * np.array(log["seconds"]), log["psnr"]))
+        if count and all(of_scenes.values()):
+            seconds, psnr = np.mean([np.mean(of, axis=0) for of in of_scenes.values()], axis=0).tolist()
             found.append((setting, *without_dips(seconds, psnr)))
     return found
 
@@ -207,11 +202,9 @@ def _marks(trade_off: TradeOff, cost: str) -> list[Mark]:
 def _beyond(panels: Iterable[tuple[Any, Sequence[Mark], str]]) -> list[str]:
     """Return a sentence that names the marks outside of axes; empty if there are none."""
     found = set()
-    for axes, marks, unit in panels:
-        for mark in marks:
-            if not _inside(axes, mark):
-                cost = f"{mark.x:,.0f}" if mark.x >= 1000 else f"{mark.x:.3g}"  # all digits before the point
-                found.add(f"{mark.point.title} ({mark.y:.1f} dB, {cost} {unit})")
+    for mark, unit in ((mark, unit) for axes, marks, unit in panels for mark in marks if not _inside(axes, mark)):
+        cost = f"{mark.x:,.0f}" if mark.x >= 1000 else f"{mark.x:.3g}"  # all digits before the point
+        found.add(f"{mark.point.title} ({mark.y:.1f} dB, {cost} {unit})")
     return [f"Beyond the axes: {'; '.join(sorted(found))}."] if found else []
 
 
@@ -258,15 +251,11 @@ def _label(panel: Any, marks: Sequence[Mark]) -> list[Any]:
 def _handles(marks: Sequence[Mark]) -> list[Any]:
     from matplotlib.lines import Line2D
 
-    def dot(area: float, label: str, **look: Any) -> Line2D:
-        look = {"marker": "o", "color": SOFT, "markeredgewidth": 0} | look
-        return Line2D([], [], linestyle="none", markersize=math.sqrt(area), label=label, **look)
-
-    handles, roles = [], {mark.role for mark in marks}
-    if "variant" in roles:
-        handles.append(dot(AREA, "variant of a method", alpha=drawing.ALPHA["variant"]))
-    if "release" in roles:
-        handles.append(dot(SMALL_AREA, "program as released", markerfacecolor="none", markeredgewidth=1.0))
+    dot, roles = {"marker": "o", "color": SOFT, "linestyle": "none"}, {mark.role for mark in marks}
+    faint = {"markersize": math.sqrt(AREA), "markeredgewidth": 0, "alpha": drawing.ALPHA["variant"]}
+    ring = {"markersize": math.sqrt(SMALL_AREA), "markeredgewidth": 1.0, "markerfacecolor": "none"}
+    known = {"variant": faint | {"label": "variant of a method"}, "release": ring | {"label": "program as released"}}
+    handles = [Line2D([], [], **dot, **look) for role, look in known.items() if role in roles]
     return [*handles, Line2D([], [], color=SOFT, linewidth=0.9, label="Pareto front")]
 
 

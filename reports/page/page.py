@@ -54,8 +54,7 @@ class Album:
 
 def html(run_set: RunSet) -> str:
     """Return the page with all other reports; a refused report is named at the top."""
-    made: dict[str, list[Any]] = {name: [] for name in REPORTS}
-    refused: list[str] = []
+    made, refused = {name: list[Any]() for name in REPORTS}, list[str]()
     for name in (name for name in REPORTS if name not in ("html", "gallery")):
         try:
             report = run_set.report(name)
