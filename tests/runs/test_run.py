@@ -146,7 +146,9 @@ def test_scores_are_not_replaced_by_those_under_other_rules_of_the_same_name(con
     with pytest.raises(RunFolderError, match=r"scores of paper .*\(bottom_crop=0.0, not 0.25\).* set run.folder"):
         run(under("protocol.paper.bottom_crop=0.25"))
     assert folder_of(config).result() == first
-    monkeypatch.setattr(pipeline, "score", lambda *_: {"paper": replace(first.scores["paper"], protocol=with_lpips)})
+    monkeypatch.setattr(
+        pipeline, "score", lambda *_, **__: {"paper": replace(first.scores["paper"], protocol=with_lpips)}
+    )
     asked = under("protocol.paper.lpips=alex")
     with_lpips = first.scores["paper"].protocol | {"lpips": "alex"}
     assert run(asked)[0].scores["paper"].protocol == with_lpips, "more than before"

@@ -93,7 +93,7 @@ def test_harmonics_are_numbered_from_0(tmp_path, generator):
 
 
 def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path, generator, monkeypatch):
-    monkeypatch.setattr(splat_file, "check_suffix", lambda path: None)  # where the converter is missing
+    monkeypatch.setattr(splat_file, "check_suffix", lambda *_: None)  # where the converter is missing
     write_splats(tmp_path / "a.ply", random_splats(1, generator))
     (tmp_path / "a.compressed.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-9])
     with pytest.raises(DataError, match="a.compressed.ply is not a readable PLY file .*end-of-file"):
@@ -102,7 +102,7 @@ def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path,
 
 def test_a_missing_converter_is_reported(tmp_path, generator, monkeypatch):
     monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
-    with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or write a .ply"):
+    with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or take a .ply"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
 
 
@@ -149,7 +149,7 @@ def test_gaussians_that_a_format_cannot_hold_are_counted_or_refused(
             vertex["x"][:moved] += np.float32(0.5 * world)
         PlyData([PlyElement.describe(vertex, "vertex")]).write(str(target))
 
-    monkeypatch.setattr(splat_file, "check_suffix", lambda path: None)  # where the converter is missing
+    monkeypatch.setattr(splat_file, "check_suffix", lambda *_: None)  # where the converter is missing
     monkeypatch.setattr(splat_file, "_convert", convert)
     path = tmp_path / "a.spz"
     if "would" in said:
