@@ -63,13 +63,9 @@ def prepare(
     if destination.name in (*IMAGE_FOLDERS, *MASK_FOLDERS) and destination.resolve().parent == source.resolve():
         raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
     place = destination.absolute().with_name(f".{destination.name}.prepare")
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = f"its folder cannot be made, {error.strerror}"
-        raise DataError(f"cannot prepare {destination} ({why}); choose another path") from error
     lock = FileLock(place / work.LOCK)
     try:
+        place.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
         if result := _existing(source, destination, options):  # of another process, in the meantime
             return result
@@ -78,7 +74,8 @@ def prepare(
         raise DataError(f"another process prepares {destination}; wait for it, or choose another path") from error
     except OSError as error:
         why = error.strerror or error
-        raise DataError(f"cannot prepare {destination} ({why}); the same command resumes") from error
+        way_out = "the same command resumes" if place.is_dir() else "its folder cannot be made: choose another path"
+        raise DataError(f"cannot prepare {destination} ({why}); {way_out}") from error
     except MemoryError as error:
         raise DataError(
             f"cannot prepare {destination} (out of memory); the same command with --threads 1 uses less, and resumes"

@@ -325,7 +325,11 @@ def test_bad_input_is_refused(scene, tmp_path):
         (scene[1], tmp_path / "there", "nothing is overwritten"),
         (tmp_path / "absent", tmp_path / "out", "is not a folder"),
         (tmp_path / "absent.mp4", tmp_path / "out", "cannot be read"),
-        (scene[1], tmp_path / "there" / "file" / "out", "its folder cannot be made, Not a directory.*choose another"),
+        (
+            scene[1],
+            tmp_path / "there" / "file" / "out",
+            r"\(Not a directory\); its folder cannot be made: choose another",
+        ),
         (scene[1], scene[1] / "images", "images would be read as the images or masks of"),
     ):
         with pytest.raises(DataError, match=message):
