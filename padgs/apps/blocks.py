@@ -211,10 +211,12 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             kept = torch.from_numpy(blocks.used[number][nearest])
             shares = {name: round(sphere_share(part), 4) for name, part in held.items()}
             # Where the data set's format reduces wide images, the block does, and images have no size of their own.
-            sizes = {v.name: (None, None) if capture.width else (v.width, v.height) for v in views}
-            frames_of = {name: replace(frames[name], width=size[0], height=size[1]) for name, size in sizes.items()}
+            sizes = [(None, None) if capture.width else (v.width, v.height) for v in views]
             content = Content(
-                frames=tuple(replace(frames_of[v.name], share=shares.get(v.name, 1.0)) for v in views),
+                frames=tuple(
+                    replace(frames[v.name], width=width, height=height, share=shares.get(v.name, 1.0))
+                    for v, (width, height) in zip(views, sizes, strict=True)
+                ),
                 cloud=Cloud(points[kept], None if colors is None else colors[kept]),
                 tracks=None,
                 split={side: tuple(frames[v.name].name for v in part) for side, part in sides.items() if scene.test},

@@ -261,8 +261,10 @@ class SplatModel:
         added = 0.0 if self._filter is None else self._filter.square_pixels
         variances = added * finest_pixels(splats.means, cameras).square()
         if self._config.resolved_low_pass_kind == "solid":
-            samples = torch.tensor([self.render_options(view).low_pass for view in self._views]).to(cameras)
-            cameras[:, 3] *= self._training_samples / samples.sqrt()  # as if the low-pass were one square pixel
+            low_pass = torch.tensor([self.render_options(view).low_pass for view in self._views]).to(cameras)
+            cameras[:, 3] *= (
+                self._training_samples / low_pass.sqrt()
+            )  # the low-pass of a sample is one square pixel now
             variances = variances + finest_pixels(splats.means, cameras).square()
         return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), variances)[1]
 
