@@ -1,6 +1,7 @@
 """A capture of two rooms as two blocks, trained one by one and merged."""
 
 import json
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from padgs.data.formats.transforms import REDUCED
 from padgs.data.formats.writers import Content, write_transforms
 from padgs.data.images import save_png
 from padgs.multirun.composition import composing, configuration
+from padgs.multirun.overrides import quoted
 from padgs.runs.run import run
 from padgs.scene import View
 
@@ -124,8 +126,14 @@ def test_blocks_of_a_format_that_reduces_wide_images_are_reduced(source, tmp_pat
     for frame in described["frames"]:
         del frame["w"], frame["h"]
     (folder / "transforms.json").write_text(json.dumps(described | {REDUCED: 16}))
-    assert CliRunner().invoke(app, ["split", str(folder), "--blocks", "2"]).exit_code == 0
-    for part in (tmp_path / "rooms-blocks").glob("rooms-block-*"):
+    done = CliRunner().invoke(app, ["split", str(folder), "--blocks", "2", "--to", str(tmp_path / "two, rooms")])
+    assert done.exit_code == 0, done.output
+    command = shlex.split(done.output.partition("next: ")[2].partition(", then")[0])
+    *_, paths = quoted(command)
+    assert [*map(str.strip, paths.split('"')[1::2])] == [
+        str(tmp_path / "two, rooms" / f"rooms-block-{n}") for n in (1, 2)
+    ]
+    for part in (tmp_path / "two, rooms").glob("rooms-block-*"):
         scene = padgs.data.load(part)
         assert all(view.width == 16 and view.mask().shape == (8, 16) for view in scene.train)
         assert "used as they are" not in " ".join(scene.notes)

@@ -170,12 +170,6 @@ def test_resuming_changes_nothing(stop):
     assert second.seconds > state.values["seconds"] or stop == 20
 
 
-def test_a_longer_budget_than_that_of_the_state_is_followed():
-    state, longer = trainer(Flat()).state(), Trainer(Flat(), tiny_scene(), Budget(50))
-    longer.load_state(state)
-    assert longer.schedule == 50
-
-
 def test_state_of_another_scene_is_refused():
     state = trainer(Flat()).state()
     scene = tiny_scene()

@@ -145,6 +145,12 @@ def test_quality_is_the_mean_ws_psnr():
     assert found == pytest.approx(sum(ws_psnr(images[v.name], v.image()).item() for v in views) / 2, abs=1e-4)
 
 
+def test_a_longer_budget_than_that_of_the_state_is_followed(scene):
+    longer = Trainer(Counted(scene), scene, Budget(2 * ITERATIONS), seed=1)
+    longer.load_state(trainer(scene, stop="end").state())
+    assert longer.schedule == 2 * ITERATIONS
+
+
 def test_too_few_views_for_a_validation_split_are_refused():
     with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
         Trainer(Counted(tiny_scene()), tiny_scene(), Budget(10, stop="auto"))
