@@ -181,9 +181,6 @@ class Capture:
     readings: tuple[Reading, ...] = ()  # the first is the usual one; see `padgs.data.conventions.best_reading`
 
 
-_CHOICES = {"split": ("auto", "files", "every", "all"), "depth": ("auto", "none"), "cameras": ("all", "panoramas")}
-
-
 @dataclass(frozen=True)
 class DataSettings:
     """The `data` group of the configuration, as far as users set it."""
@@ -203,9 +200,10 @@ class DataSettings:
     generator: Mapping[str, Any] = field(default_factory=dict)  # options of the synthetic scene
 
     def __post_init__(self) -> None:
-        for name, known in _CHOICES.items():
-            if (value := getattr(self, name)) not in known:
-                raise DataError(unknown(f"data.{name}", value, known))
+        known = {"split": ("auto", "files", "every", "all"), "depth": ("auto", "none"), "cameras": ("all", "panoramas")}
+        for name, names in known.items():
+            if (value := getattr(self, name)) not in names:
+                raise DataError(unknown(f"data.{name}", value, names))
         if self.test_every < 2:
             raise DataError(f"data.test_every is {self.test_every}; every k-th view is a test view, with k at least 2")
         if self.width is not None and (self.width < 8 or self.width % 2):

@@ -16,7 +16,6 @@ from PIL import ExifTags, Image, ImageCms
 from padgs.data.capture import DataError
 from padgs.files import DAMAGE
 
-_ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
 _SRGB_GAMMA = 0.45455  # of the gAMA chunk of a PNG
 _SRGB_CHROMATICITIES = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # white, red, green and blue of cHRM
 _CROP_PROPERTIES = (
@@ -66,7 +65,7 @@ def refuse_rotated(image: Image.Image, path: object) -> None:
     """Refuse pixels that are stored rotated, by EXIF or XMP."""
     has_exif = image.format != "PNG" or {"exif", "Raw profile type exif"} & image.info.keys()
     try:
-        by_exif = image.getexif().get(_ORIENTATION) if has_exif else 1
+        by_exif = image.getexif().get(ExifTags.Base.Orientation) if has_exif else 1
     except DAMAGE as error:
         raise DataError(f"{path} has EXIF data that cannot be read ({error}); {_REMOVE}") from error
     for source, orientation in {"EXIF": by_exif, "XMP": stated(_xmp(image), "Orientation")}.items():

@@ -25,7 +25,6 @@ BACKENDS = {
     "cpu": "padgs.render.backends.cpu:rasterize",
     "cuda": "padgs.render.backends.cuda:rasterize",
 }
-NEAR_UNITS = ("scene", "world")
 
 __all__ = ["BACKENDS", "RenderConfig", "RenderOptions", "Rendering", "make_request", "render", "resolve_backend"]
 
@@ -39,7 +38,7 @@ class RenderConfig(RenderOptions):
     backend: str = "auto"  # auto | torch | cpu | cuda
 
     def __post_init__(self) -> None:
-        check_known(self, projection=LOW_PASS_KINDS, near_unit=NEAR_UNITS, backend=("auto", *BACKENDS))
+        check_known(self, projection=LOW_PASS_KINDS, near_unit=("scene", "world"), backend=("auto", *BACKENDS))
         super().__post_init__()
 
     def options(self, scene_scale: float) -> RenderOptions:

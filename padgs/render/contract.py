@@ -30,9 +30,6 @@ NEAREST, FURTHEST = 1e-15, 1e15
 CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments belong to the tail
 CORE_SIZE, MAX_CORE_SIZE = 16, 256
 MAX_SUPERSAMPLING = 8
-BLENDINGS = ("sorted", "hybrid")
-BOUNDS = ("exact", "square")
-NEAR_CULLS = ("mean", "ellipsoid")
 LOW_PASS_KINDS = {  # of each projection, the default first; defined in `padgs.render.projection`
     "erp": ("pixels", "angular", "solid"),
     "pinhole": ("pixels", "angular", "solid"),
@@ -66,7 +63,7 @@ class RenderOptions:
     max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; more are rendered in strips
 
     def __post_init__(self) -> None:
-        check_known(self, bounds=BOUNDS, near_cull=NEAR_CULLS, blending=BLENDINGS)
+        check_known(self, bounds=("exact", "square"), near_cull=("mean", "ellipsoid"), blending=("sorted", "hybrid"))
         check(self, "a distance >= 0 in world units", lambda near: 0 <= near < math.inf, "near")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "low_pass")
         check(self, f"from 1 to {MAX_SUPERSAMPLING}", _whole(MAX_SUPERSAMPLING), "supersampling")

@@ -25,10 +25,7 @@ from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
-DEVICES = ("auto", "cpu", "cuda")
 RETRIES = ("none", "failed")
-SWITCH = ("off", "on")
-CONTINUED = "continued"  # label of runs with `init` in tables
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ class RunOptions:
     pictures: bool = True  # save ground truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        check_known(self, device=DEVICES)
+        check_known(self, device=("auto", "cpu", "cuda"))
         check(self, "not empty (is a variable of the shell unset?)", bool, "folder")
         counts = ("jobs", "threads", "log_every", "probe_every", "checkpoint_every")
         check(self, "at least 1", lambda count: count is None or count >= 1, *counts)
@@ -139,7 +136,7 @@ class Settings:
     smallest: str = "off"  # on: search for the smallest model after the run, as padgs smallest does
 
     def __post_init__(self) -> None:
-        check_known(self, retry=RETRIES, smallest=SWITCH)
+        check_known(self, retry=RETRIES, smallest=("off", "on"))
         check(self, "in [0, 2^63)", lambda seed: 0 <= seed < 2**63, "seed")
 
 
@@ -165,7 +162,7 @@ class RunConfig(Settings):
     @property
     def row(self) -> str:
         """Label of the run within an experiment: variant, stress condition, and warm start."""
-        return ", ".join(filter(None, (self.variant, self.stress.title, CONTINUED if self.init else "")))
+        return ", ".join(filter(None, (self.variant, self.stress.title, "continued" if self.init else "")))
 
     def values(self) -> dict[str, Any]:
         """Return the configuration as plain values in the shape of the YAML files, defaults included.

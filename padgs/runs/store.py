@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from padgs.runs.config import RunConfig
 
 PROGRESS = "progress"  # key of `Progress` in a checkpoint
-HASH_DIGITS = 10
 LONGEST_WORD = 48  # letters of a scene or variant in a folder's name, which may have 255 bytes
 LOCK, OWNER = ".lock", ".owner.json"
 
@@ -248,7 +247,7 @@ def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str 
     stress = "-".join(map(str, values.get("stress", {}).values()))
     words = [scene, preset or values["method"]["name"], values["variant"], stress]
     readable = [re.sub(r"(?:[^\w.-]|_)+", "-", normalize("NFC", word))[:LONGEST_WORD].strip("-.") for word in words]
-    return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])
+    return "_".join([*(word for word in readable if word), digest[:10]])
 
 
 @dataclass(frozen=True)

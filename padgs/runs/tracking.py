@@ -18,8 +18,6 @@ from padgs import results
 from padgs.checks import check_known, install_command
 from padgs.results import Result
 
-KINDS = ("auto", "mlflow", "none")
-DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs without an experiment
 SERVERS = ("http", "databricks")  # beginnings of their URIs
 PATIENCE = 60.0  # seconds to wait for another process that creates the database
 SETTINGS = {
@@ -42,7 +40,7 @@ class TrackingOptions:
     uri: str | None = None  # URI of a server or database; None = mlflow.db in run.folder
 
     def __post_init__(self) -> None:
-        check_known(self, kind=KINDS)
+        check_known(self, kind=("auto", "mlflow", "none"))
 
 
 class Tracker:
@@ -55,7 +53,7 @@ class Tracker:
 
         `experiment` and `multirun` (empty: none) are names in mlflow; `say` shows a line to the user, at most once.
         """
-        self._runs, self.name = runs.absolute(), experiment or DEFAULT_EXPERIMENT
+        self._runs, self.name = runs.absolute(), experiment or "padgs"
         self._uri = options.uri or f"sqlite:///{self._runs / 'mlflow.db'}"
         self._say, self._multirun = say, multirun
         self._client: Any = None

@@ -9,7 +9,6 @@ from padgs.training.loss import DEPTH_KINDS, NORMALISATIONS, ROW_WEIGHTS
 from padgs.training.schedule import LEARNING_RATES
 
 AUTO = "auto"  # number of Gaussians or iterations as needed
-STOPS = ("end", AUTO)
 CLOCKS = ("wall", "cpu")  # cpu: summed over all threads; other programs change it less
 
 
@@ -33,7 +32,7 @@ class Budget:
         rule = "at least 1 Gaussian, auto for as many as needed, or null for no target"
         check(self, rule, lambda n: n in (None, AUTO) or isinstance(n, int) and n >= 1, "gaussians")
         check(self, "> 0 and finite, or null", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
-        check_known(self, clock=CLOCKS, stop=STOPS)
+        check_known(self, clock=CLOCKS, stop=("end", AUTO))
 
     def __str__(self) -> str:
         """Return the length in words.

@@ -23,7 +23,7 @@ from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.loop import Trainer
-from padgs.training.options import Budget, TrainOptions
+from padgs.training.options import Budget
 
 DEGREE = 3
 FITTED_DEGREE = 1  # by least squares; higher degrees take gigabytes, and gain nothing after distillation
@@ -33,7 +33,6 @@ RIDGE = 1e-2  # regularisation of direction-dependent coefficients, relative to 
 MIN_PIXELS = 0.05  # contribution over all views below which a Gaussian is dropped
 MAX_OPACITY = 0.995  # keeps logits finite
 MIN_FLATNESS = 1e-4  # smallest scale of a Gaussian relative to its largest
-DISTILLATION = TrainOptions()
 
 
 def sample_cameras(views: Sequence[View], count: int = VIEWS) -> list[View]:
@@ -130,5 +129,5 @@ def distill(
     targets = tuple(map(target, scene.train))
     fixed = SplatOptions(densify_until=0)
     student = SplatModel(splats, fixed, config, extent=ExtentOptions().extent_of(scene), iterations=steps)
-    for record in Trainer(student, replace(scene, train=targets), Budget(steps), DISTILLATION).records():
+    for record in Trainer(student, replace(scene, train=targets), Budget(steps)).records():
         progress(record.iteration)

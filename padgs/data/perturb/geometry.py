@@ -18,7 +18,6 @@ DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # horizontal; a rotation about
 MIN_POINTS = 8  # explicit Gaussians take their first size from their three nearest neighbors
 NEAR = 0.02  # scene scales: closer to a camera than any surface
 FAR = 10.0  # times the size of the cloud
-GRAY = 128
 QUANTILES = (0.02, 0.98)  # of the points, between which the size of the cloud is measured
 
 
@@ -108,7 +107,7 @@ def random_points(scene: Scene, shape: str, random: np.random.Generator) -> Scen
         if "shell" in shape:
             distance[: count // 10] = FAR * radius
         points = center + distance[:, None] * _directions(count, random)
-    gray = torch.full_like(scene.point_colors, GRAY)
+    gray = torch.full_like(scene.point_colors, 128)
     return replace(scene, points=torch.from_numpy(points).to(scene.points), point_colors=gray)
 
 
