@@ -38,6 +38,13 @@ WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint1
 DEPTH_STEPS = 1000  # of 16-bit depth, per scene scale
 # Stated explicitly: by default, players take large videos to be BT.709, and small ones to be BT.601.
 COLOURS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
+SPHERICAL = UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
+XML = (
+    '<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" '
+    'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/"><GSpherical:Spherical>true</GSpherical:Spherical>'
+    "<GSpherical:Stitched>true</GSpherical:Stitched><GSpherical:ProjectionType>equirectangular</GSpherical:"
+    "ProjectionType><GSpherical:StitchingSoftware>padgs</GSpherical:StitchingSoftware></rdf:SphericalVideo>"
+)
 
 
 def views_along(
@@ -201,15 +208,6 @@ def _mp4(path: Path, view: View, fps: float, spherical: bool) -> Iterator[WriteF
             video.mux(stream.encode())  # flush the encoder
         if spherical:
             mark_spherical(draft)
-
-
-SPHERICAL = UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
-XML = (
-    '<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" '
-    'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/"><GSpherical:Spherical>true</GSpherical:Spherical>'
-    "<GSpherical:Stitched>true</GSpherical:Stitched><GSpherical:ProjectionType>equirectangular</GSpherical:"
-    "ProjectionType><GSpherical:StitchingSoftware>padgs</GSpherical:StitchingSoftware></rdf:SphericalVideo>"
-)
 
 
 def mark_spherical(video: Path) -> None:

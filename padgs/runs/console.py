@@ -24,6 +24,26 @@ if TYPE_CHECKING:
     from padgs.scene import Scene
     from padgs.training.loop import Record
 
+REDRAWS_PER_SECOND = 5
+SECONDS_BETWEEN_LINES = 10.0  # without a terminal
+RECENT = 64  # records that the speed is measured over
+# Errors of a terminal that was closed, and of rich for a pipe whose reader has ended: they end no run.
+UNREAD = (OSError, SystemExit)
+COLUMNS, BAR = 80, 8  # characters of the progress line, and of the bar in it
+MISSING = "–"
+# Least PSNR of a verdict in words
+SHARPNESS = ((28, "sharp"), (24, "slightly soft"), (20, "blurred"), (-float("inf"), "hardly recognisable"))
+MEANINGS = {  # word in the name of a metric -> meaning, with an arrow towards better values
+    "psnr": "↑ dB",
+    "ssim": "↑ structural similarity",
+    "lpips": "↓ perceptual distance",
+    "seam": "error at ±180° over elsewhere, best 1",
+    "rel": "↓ relative error of depth",
+    "delta": "↑ share of depths within a factor of 1.25",
+}
+
+D = TypeVar("D", bound="Display")
+
 
 def say(console: Console, text: object, style: str = "") -> None:
     """Print lines without wrapping."""
@@ -34,17 +54,6 @@ def write(console: Console, *parts: RenderableType, **options: Any) -> None:
     """Print to a console that may have been closed."""
     with suppress(*UNREAD):
         console.print(*parts, **options)
-
-
-REDRAWS_PER_SECOND = 5
-SECONDS_BETWEEN_LINES = 10.0  # without a terminal
-RECENT = 64  # records that the speed is measured over
-# Errors of a terminal that was closed, and of rich for a pipe whose reader has ended: they end no run.
-UNREAD = (OSError, SystemExit)
-COLUMNS, BAR = 80, 8  # characters of the progress line, and of the bar in it
-MISSING = "–"
-
-D = TypeVar("D", bound="Display")
 
 
 class Display:
@@ -131,18 +140,6 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-# Least PSNR of a verdict in words
-SHARPNESS = ((28, "sharp"), (24, "slightly soft"), (20, "blurred"), (-float("inf"), "hardly recognisable"))
-MEANINGS = {  # word in the name of a metric -> meaning, with an arrow towards better values
-    "psnr": "↑ dB",
-    "ssim": "↑ structural similarity",
-    "lpips": "↓ perceptual distance",
-    "seam": "error at ±180° over elsewhere, best 1",
-    "rel": "↓ relative error of depth",
-    "delta": "↑ share of depths within a factor of 1.25",
-}
 
 
 def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:

@@ -36,6 +36,8 @@ POSE_RATES = {
     LEARNED: ((1e-3, 1e-5), (2e-3, 2e-5)),  # do no harm to exact poses
     LEARNED_FAST: ((1e-2, 1.6e-4), (1e-2, 6e-3)),  # as published (SC-OmniGS)
 }
+RATE = 3e-3  # of log-gains of exposures; it does not decay, because exposures that freeze early are wrong
+OFFSET_RATE = RATE / 5  # of their offsets, in colours from 0 to 1
 MAP, FISHEYES = "map", "fisheyes_"
 LENSES = (GIVEN, MAP, *(FISHEYES + axis for axis in AXES))
 
@@ -167,10 +169,6 @@ def _corrected(given: Tensor, quaternions: Tensor, shifts: Tensor) -> Tensor:
 def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
     """Return rotations [V, 3, 3] times vectors [V, 3] or [3]."""
     return (rotations @ vectors[..., None])[..., 0]
-
-
-RATE = 3e-3  # of log-gains; it does not decay, because exposures that freeze early are wrong
-OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
 
 
 class Corrections(nn.Module):

@@ -17,6 +17,7 @@ from padgs.training.model import State
 from padgs.training.schedule import Pace, ParameterGroup
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
+ADAM = "adam/"  # prefix of its tensors in a state
 READ_EVERY = 10  # iterations between reads of the loss from a GPU
 
 
@@ -60,9 +61,6 @@ def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collecti
     for name, parameter in model.named_parameters():
         parameter.data = tensors[name].to(parameter).clone()
         parameter.grad = None
-
-
-ADAM = "adam/"  # prefix of its tensors in a state
 
 
 class PlainAdam(torch.optim.Adam):

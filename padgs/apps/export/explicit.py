@@ -25,6 +25,7 @@ from padgs.scene import View
 
 DISTILLATION_STEPS = 300
 UNSMOOTHED = "--smooth changes nothing: the method has no 3D filter, or it is in the scales already"
+UP = (0.0, -1.0, 0.0)  # in most viewers of 3DGS files, as in most structure from motion
 AXES = "axes and units of the scene; its cameras look along z, x is right, y down"
 
 
@@ -134,9 +135,6 @@ def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None
         f"baked: {len(splats)} of {method.size().counts['gaussians']} Gaussians are visible; WS-PSNR of the {kind} "
         f"views {after:.2f} dB, {change}"
     )
-
-
-UP = (0.0, -1.0, 0.0)  # in most viewers of 3DGS files, as in most structure from motion
 
 
 @torch.no_grad()

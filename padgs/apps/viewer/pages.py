@@ -26,6 +26,7 @@ from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
 IDLE_SECONDS = 0.2  # without a change, after which the full resolution is rendered
+UPDATE_SECONDS = 1.0  # between searches for a newer checkpoint
 FRAME_SECONDS = 0.06  # target while something changes; the resolution adapts
 MIN_RESOLUTION = 0.125  # factor on width and height
 WIDTHS = ("512", "768", "1024", "1536", "2048")
@@ -246,9 +247,6 @@ def sides(longer: int, aspect: float) -> tuple[int, int]:
     """
     shorter = max(2, round(longer * min(aspect, 1 / aspect)))
     return (longer, shorter) if aspect >= 1 else (shorter, longer)
-
-
-UPDATE_SECONDS = 1.0  # between searches for a newer checkpoint
 
 
 @contextmanager

@@ -37,7 +37,6 @@ _REMEDIES = (
     "take them closer together (of a video: --per-second), hide what moves with the camera in a mask (--mask), or try "
     "--accurate"
 )
-
 _LATE = ("threads", "level", "known", "mapper")  # options without influence on what the working folder keeps
 
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, total)
