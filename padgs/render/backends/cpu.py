@@ -113,8 +113,7 @@ class _Image(native.NativeImage):
             "evaluated": int(pairs[0]),
             "contributing": int(pairs[1]),
         }
-        visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
-        return pixels, visible
+        return pixels, self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
 
     def gradient_sums(self, pixels: native.Pixels, background: Tensor, upstream: native.Upstream) -> Tensor:
         count = len(self._projected.boxes)
@@ -141,8 +140,7 @@ class _Image(native.NativeImage):
             owner = torch.repeat_interleave(torch.arange(count), strip.slot_start.diff())
             sums.index_add_(0, owner, found[:, :-1].double())
             peak.scatter_reduce_(0, owner, found[:, -1], "amax")
-        error, change, contribution = sums.unbind(-1)
-        return Removals(error, change, contribution, peak)
+        return Removals(*sums.unbind(-1), peak)
 
     def project_backward(
         self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool

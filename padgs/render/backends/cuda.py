@@ -80,7 +80,6 @@ class DeviceProjected(Strips):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
     The host reads one thing back: the number of instances in each row of tiles, before memory for them is allocated.
-    With a given capacity it does not wait for that: invisible Gaussians are then skipped instead of left out.
     """
 
     def __init__(
@@ -88,8 +87,8 @@ class DeviceProjected(Strips):
     ) -> None:
         """Project by `pose` [4, 4] on the device (that of the camera is not used), sort and count.
 
-        With a capacity, a single strip has room for so many instances, and `counts` holds their number on the device;
-        with 0, the device is waited for once, and memory has the exact size.
+        With a capacity, the host does not wait: a single strip has room for so many instances, `counts` holds their
+        number on the device, and invisible Gaussians are skipped instead of left out.
         """
         device, count = pose.device, inputs.count
         self.queue = cuda.queue(device)
@@ -167,8 +166,7 @@ class _Image(NativeImage):
         _capacities[key] = min(wanted, limit) if instances <= limit else 0  # 0: strips need the exact number
         known = {"gaussians": inputs.count, "visible": self._projected.visible, "instances": instances}
         self.counters = LazyCounters(known, ("evaluated", "contributing"), pairs.tolist)
-        visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
-        return pixels, visible
+        return pixels, self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
 
     def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         projected, device, core_size = self._projected, background.device, self._core_size
@@ -202,8 +200,7 @@ class _Image(NativeImage):
             of_slots = functools.partial(torch.segment_reduce, offsets=starts, axis=0, initial=0, unsafe=True)
             sums[drawn] += of_slots(found[:, :-1].double(), "sum")
             peak[drawn] = torch.maximum(peak[drawn], of_slots(found[:, -1].contiguous(), "max"))
-        error, change, contribution = sums.unbind(-1)
-        return Removals(error, change, contribution, peak)
+        return Removals(*sums.unbind(-1), peak)
 
     def project_backward(
         self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool

@@ -206,9 +206,8 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
     if options.projection not in PROJECTIONS:
         known = ", ".join(PROJECTIONS)
         raise ValueError(f"the native libraries do not know projection {options.projection!r}; known: {known}")
-    low_pass, deviation = low_pass_of(options, camera), -1.0
-    if isinstance(camera, RayTable):
-        deviation = off_panorama(camera.table)
+    low_pass = low_pass_of(options, camera)
+    deviation = off_panorama(camera.table) if isinstance(camera, RayTable) else -1.0
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
     return NativeCamera(
         camera.width,
