@@ -234,8 +234,7 @@ def found_images(capture: Capture) -> Capture:
     split = capture.split and {
         side: tuple(names.get(name, name) for name in listed_names) for side, listed_names in capture.split.items()
     }
-    notes = (*capture.notes, note)
-    return replace(capture, image_folder=folder, frames=tuple(frames), split=split, notes=notes)
+    return replace(capture, image_folder=folder, frames=tuple(frames), split=split, notes=(*capture.notes, note))
 
 
 def _without_unlisted(capture: Capture, options: DataOptions) -> Capture:

@@ -79,8 +79,7 @@ def check(
     report.format = capture.format
     digests = _check_images(capture, report, progress)
     damaged = bool(report.problems)
-    scene = _assemble(capture, options, report)
-    if scene is None:
+    if (scene := _assemble(capture, options, report)) is None:
         return report
     views = (*scene.train, *scene.test)
     poses = torch.stack([view.cam_from_world for view in views])

@@ -75,8 +75,7 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True, within: Cr
         raise DataError(f"{path} ends in zeros, as after an interrupted download; copy it again or remove it")
     if is_cut or may_be_transparent:
         _decode(data, path, "L" if mask else "RGB")
-    digest = hashlib.sha256(data).hexdigest()
-    return ImageFile(path, *size, digest, crop, conversion is not None, image.format or "")
+    return ImageFile(path, *size, hashlib.sha256(data).hexdigest(), crop, conversion is not None, image.format or "")
 
 
 @contextmanager

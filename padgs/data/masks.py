@@ -110,8 +110,7 @@ def find_masks(
             masks.append(None if fixed is None else Mask(None, fixed))
             continue
         if (key := (path, image.crop)) not in inspected:
-            is_panorama = frame.lens is None
-            inspected[key] = inspect(path, mask=True, panorama=is_panorama, within=image.crop)
+            inspected[key] = inspect(path, mask=True, panorama=frame.lens is None, within=image.crop)
         mask_file = inspected[key]
         is_reduced = frame.lens is None and mask_file.width >= width  # of the view; all panoramas have one shape
         if not is_reduced and (mask_file.width, mask_file.height) not in ((image.width, image.height), (width, height)):
@@ -170,8 +169,7 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         raise DataError(f"data.mask={given}: no such file or folder; keywords: auto, none, inverted, rows:959/1024")
     named = {frame.name: frame.mask for frame in capture.frames if frame.mask is not None}
     if given is None and named:
-        absent = [path for path in named.values() if not path.is_file()]
-        if absent:
+        if absent := [path for path in named.values() if not path.is_file()]:
             raise DataError(f"the mask {absent[0]} that {capture.format} names does not exist; set data.mask=none")
         return named, f"masks: those that {capture.format} names, for {len(named)} of {len(capture.frames)} views"
     if given is None:

@@ -80,8 +80,7 @@ def perspective_views(panorama: View, rotations: Tensor, lens: Pinhole) -> tuple
         pose[:3] = rotation.to(pose) @ pose[:3]
         load_pixels = pixels and _Pixels(panorama, rotation, lens, pixels)
         load_mask = mask and _Mask(panorama, rotation, lens, mask)
-        size = lens.width, lens.height
-        views.append(View(name, pose, *size, load_pixels, load_mask, lens, share=panorama.share))
+        views.append(View(name, pose, lens.width, lens.height, load_pixels, load_mask, lens, share=panorama.share))
     return tuple(views)
 
 

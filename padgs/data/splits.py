@@ -126,8 +126,7 @@ def spellings(name: str) -> Iterator[str]:
 
 def _every(names: Names, every: int, mode: str) -> Split:
     test = tuple(range(0, len(names), every))
-    train = tuple(i for i in range(len(names)) if i % every)
-    if not train:
+    if not (train := tuple(i for i in range(len(names)) if i % every)):
         raise DataError(
             f"{len(names)} posed view(s) cannot be split; at least 2 are needed, to train and to test "
             "on: set data.split=all"

@@ -40,8 +40,7 @@ ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.j
 
 def detect(path: Path) -> tuple[str, str]:
     """Detect the format of a data set; return its name and the reason. A DataError lists what identifies a format."""
-    found = _found(path)
-    if not found:
+    if not (found := _found(path)):
         names = [child.name for child in sorted(path.iterdir())] if path.is_dir() else []
         inside = listed(names) if path.is_dir() else "a file"
         above = [str(parent) for parent in list(path.absolute().parents)[2::-1] if _found(parent)][:1]

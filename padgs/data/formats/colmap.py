@@ -56,8 +56,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     files = {name: file for name in model_files.FILES if (file := model_files.find_file(model, name))}
     colored = None if "points3D" in files else first_ply(model, PLY)
     needed = model_files.FILES if colored is None and options.points == "auto" else model_files.FILES[:2]
-    absent = [name for name in needed if name not in files]
-    if absent:
+    if absent := [name for name in needed if name not in files]:
         raise DataError(
             f"the COLMAP model {model} lacks {listed(absent)} (.bin or .txt); export the whole model"
             + (", or set data.points to a PLY file or to random" if absent == ["points3D"] else "")
@@ -117,8 +116,7 @@ def _reference_notes(images: list[model_files.Image], points: model_files.Points
     if absent and points.row_of:
         total = absent + int(known.sum())
         notes.append(f"{absent} of {total} observations are of points that the model does not hold; they are left out")
-    lost = sorted(points.images - {image.id for image in images})
-    if lost:
+    if lost := sorted(points.images - {image.id for image in images}):
         notes.append(f"points name {len(lost)} images that the model does not hold (id {listed(lost)}); left out")
     return notes
 

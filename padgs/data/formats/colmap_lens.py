@@ -55,8 +55,7 @@ def _lens(camera: Camera, width: int, height: int) -> Pinhole | RayTable:
         rays = np.asarray(model.cam_ray_from_img(pixels), np.float64)
         off = np.linalg.norm(np.asarray(model.img_from_cam(rays), np.float64) - pixels, axis=1)
         rays[~(off < MAX_RAY_ERROR)] = np.nan
-    missing = np.isnan(rays).any(1).mean()
-    if missing:
+    if missing := np.isnan(rays).any(1).mean():
         raise ValueError(f"{missing:.2%} of its pixels lie outside of the lens")
     return RayTable(torch.from_numpy(rays.reshape(height, width, 3)).float(), model.mean_focal_length(), name.lower())
 

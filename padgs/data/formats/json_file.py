@@ -31,8 +31,7 @@ class Json:
     def __getitem__(self, key: str) -> Json:
         fields = self._of(Mapping, f"an object with the field {key!r}")
         if key not in fields:
-            has = listed(fields) or "none"
-            raise DataError(f"{self.where} lacks the field {key!r}; it has {has}")
+            raise DataError(f"{self.where} lacks the field {key!r}; it has {listed(fields) or 'none'}")
         return Json(fields[key], f"{key} of {self.where}")
 
     def get(self, key: str) -> Json | None:

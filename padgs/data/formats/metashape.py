@@ -42,8 +42,7 @@ def read(path: Path, options: DataOptions) -> Capture:
 
     A DataError: no XML, no aligned camera, a sensor that is not spherical, or components without a common frame.
     """
-    file = find_xml(path)
-    if file is None:
+    if (file := find_xml(path)) is None:
         raise DataError(f"{path} holds no cameras.xml; export it in Metashape: File > Export > Export Cameras")
     try:
         root = XML.fromstring(read_bytes(file))

@@ -116,8 +116,7 @@ def _mvg_poses(data: Json) -> dict[int, Tensor]:
 def read_opensfm(path: Path, options: DataOptions) -> Capture:
     """Read the reconstruction with the most shots."""
     file = file_in(path, "reconstruction.json")
-    parts = read_json(file).entries()
-    if not parts:
+    if not (parts := read_json(file).entries()):
         raise DataError(f"{file} must hold a list of reconstructions with at least one in it")
     best = max(parts, key=lambda part: len(part["shots"].items()))
     images = image_folder(file.parent, options.images)
@@ -146,8 +145,7 @@ def _opensfm_cloud(part: Json) -> Cloud | None:
     points = [point for point in points if point.get("color")] or points
     where, colors = f"the points of {part.where}", None
     positions = Json([point["coordinates"].value for point in points], where)
-    paint = [color.value for point in points if (color := point.get("color"))]
-    if paint:
+    if paint := [color.value for point in points if (color := point.get("color"))]:
         values = Json(paint, f"color of {where}").numbers(len(points), 3)
         colors = color_bytes(whole_if_possible(values.numpy()), where)
     return Cloud(positions.numbers(len(points), 3), colors)

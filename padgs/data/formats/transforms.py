@@ -49,7 +49,8 @@ def read(path: Path, options: DataOptions) -> Capture:
             split[side] = tuple(_name(name) for name in names.entries())
     notes: tuple[str, ...] = ()
     if "" in metas and path != file and sides:  # another program's split of these frames?
-        pair = {side: tuple(_name(frame["file_path"]) for frame in _frames(part)) for side, part in sides.items()}
+        halves = {side: read_json(part)["frames"].entries() for side, part in sides.items()}
+        pair = {side: tuple(_name(frame["file_path"]) for frame in half) for side, half in halves.items()}
         if split or not set().union(*pair.values()) <= {frame.name for frame in frames}:
             notes = (f"not used: {listed(part.name for part in sides.values())}; {FILE} has the views",)
         else:
@@ -71,8 +72,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     if any(frame.get("depth_file_path") for meta in metas.values() for frame in meta["frames"].entries()):
         notes += (f"depth: depth_file_path is not read; {HOW}",)
     width = reduced.whole() if (reduced := first.get(REDUCED)) else None
-    stated = split or None
-    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, stated, meant, width, notes=notes)
+    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant, width, notes=notes)
 
 
 def transforms_file(path: str | None, format: str) -> Path | None:
@@ -99,10 +99,6 @@ def _frame(meta: Json, frame: Json, folder: Path, root: Path, *, reads_masks: bo
     if share.ndim or not 0 < share <= 1:
         raise DataError(f"{stated.where} is {stated.value}; it must be a number above 0 and at most 1, for each pass")
     return Frame(name, root / name, pose, width, height, mask and mask.path_in(folder), share=share.item(), lens=lens)
-
-
-def _frames(path: Path) -> list[Json]:
-    return read_json(path)["frames"].entries()
 
 
 def _name(path: Json) -> str:

@@ -36,9 +36,7 @@ class Changed:
 
     def prefetch(self) -> None:
         """Start loading in the background if the source can."""
-        start = getattr(self.source, "prefetch", None)
-        if start is not None:
-            start()
+        getattr(self.source, "prefetch", lambda: None)()
 
 
 @condition(

@@ -110,8 +110,7 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
         view, name = split_name(image.name)
         matrix = torch.from_numpy(np.array(image.cam_from_world().matrix()))
         poses.setdefault(name, rigid(rotations[view].mT @ matrix[:, :3], rotations[view].mT @ matrix[:, 3]))
-        with_point = [point for point in image.points2D if point.has_point3D()]
-        if with_point:
+        if with_point := [point for point in image.points2D if point.has_point3D()]:
             pixels = torch.from_numpy(np.array([point.xy for point in with_point]))
             half = view_lens(width).width / 2
             rays = torch.cat((pixels / half - 1, torch.ones(len(pixels), 1, dtype=torch.float64)), dim=1)
