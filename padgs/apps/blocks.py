@@ -65,15 +65,14 @@ def bisect(affinity: np.ndarray, members: np.ndarray, count: int) -> list[np.nda
     scaled = part / np.sqrt(degree[:, None] * degree)
     order = np.argsort(np.linalg.eigh(scaled)[1][:, -2] / np.sqrt(degree), kind="stable")
     part, degree = part[np.ix_(order, order)], degree[order]
-    best: tuple[float, int, int] | None = None
+    best = (np.inf, 0, 0)  # cost, cut, first
     for first in {count // 2, count - count // 2}:
         share = len(members) * first / count
         low, high = math.floor(share * (1 - SLACK)), math.ceil(share * (1 + SLACK))
         for cut in range(max(low, first), min(high, len(members) - count + first) + 1):
             between = part[:cut, cut:].sum()
             cost = between / degree[:cut].sum() + between / degree[cut:].sum()
-            best = min(best or (np.inf, 0, 0), (cost, cut, first))
-    assert best is not None, "there are at least as many members as clusters"
+            best = min(best, (cost, cut, first))
     _, cut, first = best
     rest = bisect(affinity, members[order[cut:]], count - first)
     return [*bisect(affinity, members[order[:cut]], first), *rest]
@@ -273,8 +272,7 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
         if numbers.count(number) != 1:
             trouble = "no run" if number not in numbers else "several runs"
             raise ValueError(f"block {number + 1} of {block['count']} has {trouble}; give one run of each block")
-    differing = sorted({key for run in runs for key in _differing(run, first)})
-    if differing:
+    if differing := sorted({key for run in runs for key in _differing(run, first)}):
         say(console, f"trained differently: {', '.join(differing)}; the merged run states those of {first.folder}")
     folder = _folder_of(first).resolve()
     whole = {"path": os.path.normpath(folder / block["source"]), "format": block["format"], **block["options"]}

@@ -218,10 +218,10 @@ def mark_spherical(video: Path) -> None:
             raise ValueError(f"{video} ends with a box {kind.decode('latin1')!r}; it must end with the index, moov")
         file.seek(start)
         index = file.read(size)
-        tracks = [(at, length) for kind, at, length in _boxes(BytesIO(index), 8, size) if kind == b"trak"]
-        if not tracks:
+        boxes = _boxes(BytesIO(index), 8, size)
+        if (track := next((box for box in boxes if box[0] == b"trak"), None)) is None:
             raise ValueError(f"{video} has no track; encode it again")
-        at, length = tracks[0]
+        _, at, length = track
         content = SPHERICAL + XML.encode()
         box = struct.pack(">I4s", 8 + len(content), b"uuid") + content
         file.seek(start)

@@ -152,8 +152,7 @@ class ExternalRun(LoadedRun):
             splats = transform_splats(splats, world @ given)
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
             raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
-        config = replace(config, options=ExternalOptions(digest, transform))
+        config = replace(config, options=ExternalOptions(hashlib.sha256(file.read_bytes()).hexdigest(), transform))
         splats.scene_scale = scene.scale
         splats.to(scene.points.device)
         folder = file.with_name(re.sub(r"(\.compressed)?\.\w+$", "", file.name))

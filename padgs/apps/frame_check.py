@@ -131,8 +131,6 @@ def check_frame(
     """
     views = [view for view in scene.train if view.lens is None]
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
-    if not views:
-        return FrameCheck(float("inf"), 0.0)
     truths = [_small(view) for view in views]
     constants = [mean_color(truth, sphere_weight(truth, mask)).item() for _, truth, mask in truths]
     if not (compared := [index for index, constant in enumerate(constants) if constant < ONE_COLOR]):

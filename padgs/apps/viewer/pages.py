@@ -153,8 +153,7 @@ class Page:
         cam_from_world = torch.from_numpy(pose)
         if options.camera == "panorama" and self._level.value:
             cam_from_world = renders.level(cam_from_world, self._up)
-        renderers = tuple(self._by_name[name] for name in names)
-        return PageState(options, cam_from_world, width, height, renderers, names)
+        return PageState(options, cam_from_world, width, height, tuple(self._by_name[name] for name in names), names)
 
     def save_picture(self) -> None:
         """Let the browser download the picture, at full resolution."""
