@@ -83,10 +83,10 @@ class BudgetOptions:
 
     def asked(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, by key."""
-        time = {} if self.seconds is None else {"seconds": self.seconds, "clock": self.clock}
-        rest = {"gaussians": self.gaussians, "stop": self.stop}
         usual = asdict(BudgetOptions())
-        return {**time, **{name: value for name, value in rest.items() if value != usual[name]}}
+        if self.seconds is not None:
+            del usual["clock"]  # always stated beside seconds
+        return {name: value for name, value in asdict(self).items() if value != usual.get(name)}
 
 
 @dataclass(frozen=True)
@@ -250,8 +250,7 @@ def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
     kind = lookup(METHODS, name, "method")
     defaults: list[Any] = [f"/fields/method/{name}@method"]
     for group, own, usual in (("render", kind.RENDER, RenderConfig()), ("train", kind.TRAIN, TrainOptions())):
-        changes = {key: value for key, value in asdict(own).items() if value != getattr(usual, key)}
-        if changes:
+        if changes := {key: value for key, value in asdict(own).items() if value != getattr(usual, key)}:
             yield group, {group: changes}
             defaults.append({f"override /{group}": name})
     yield "method", {"defaults": defaults}

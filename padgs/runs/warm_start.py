@@ -75,8 +75,7 @@ class WarmStart:
 
 def _finished(store: RunStore) -> Result:
     """Return the result of a run that ended well; if there is none, raise a ConfigError."""
-    result = store.result()
-    if result is None:
+    if (result := store.result()) is None:
         what = "is not finished" if (store.path / results.CONFIG_NAME).exists() else "is no folder of a run"
         raise ConfigError(f"init={store.path} {what}; give a run of which padgs-run has shown the scores")
     if not result.ok:

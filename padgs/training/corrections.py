@@ -84,8 +84,7 @@ class PoseRefinement(nn.Module):
     def __init__(self, names: Sequence[str], given: Tensor, *, scale: float = 1.0) -> None:
         """Begin without corrections; `given` is [V, 4, 4] cam_from_world. Two views of one name are a ValueError."""
         super().__init__()
-        twice = sorted({name for name in names if list(names).count(name) > 1})
-        if twice:
+        if twice := sorted({name for name in names if list(names).count(name) > 1}):
             raise ValueError(f"several training views are called {twice[0]!r}; poses are kept by name, rename them")
         self.names = list(names)
         self.register_buffer("given", given.double())

@@ -25,8 +25,7 @@ def squared_spacing(points: Tensor) -> Tensor | None:
     """Return the mean square distance [N] of points [N, 3] to the three nearest others, float64; None for one point."""
     from scipy.spatial import KDTree
 
-    neighbours = min(NEIGHBOURS, len(points) - 1)
-    if neighbours < 1:
+    if (neighbours := min(NEIGHBOURS, len(points) - 1)) < 1:
         return None
     xyz = points.detach().double().cpu().numpy()
     distances, _ = KDTree(xyz).query(xyz, k=neighbours + 1)  # the first neighbour is the point itself

@@ -79,8 +79,7 @@ class CameraMap(nn.Module):
     def undistorted(self, view: View, target: Target, weight: str) -> Target:
         """Return a training image and its mask as an ideal camera would take them; `weight` is in `ROW_WEIGHTS`."""
         pixels = self._resized(self.source_pixels(), view.width, view.height)
-        mask = view.mask(device=pixels.device)
-        if mask is None:
+        if (mask := view.mask(device=pixels.device)) is None:
             return Target(sample_pixels(target.image, pixels), target.weight)
         mask = mask[..., None]
         layers = sample_pixels(torch.cat((target.image, target.image * mask, mask), dim=-1), pixels)

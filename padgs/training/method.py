@@ -93,11 +93,10 @@ class Method(ABC):
             known = None if self._loaded_state is None else self._loaded_state.values["schedule"]
             budget = replace(budget, iterations=known or self._schedule_length(scene, budget, lap))
         self._model = self._initial_model(scene, budget.iterations)
+        trained: Any = self._model
         if self.train_options.refine:
-            refined: Any = Refined(self._model, self.train_options.learning_rates, budget.iterations)
-            self._trainer = self.build_trainer(refined, scene, budget, stage)
-        else:
-            self._trainer = self.build_trainer(self._model, scene, budget, stage)
+            trained = Refined(self._model, self.train_options.learning_rates, budget.iterations)
+        self._trainer = self.build_trainer(trained, scene, budget, stage)
         self._trainer.seconds, self._trainer.cpu_seconds = lap.seconds()
         self._trainer.began = self._trainer.spent
         if self._warm_start_state is not None:

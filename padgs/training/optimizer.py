@@ -145,8 +145,7 @@ class Optimizer:
         """Load the moments from a whole state; parameters without moments begin without."""
         self.adam.state.clear()
         for name, parameter in self.parameters().items():
-            moments = state.under(f"{ADAM}{name}/")
-            if moments:
+            if moments := state.under(f"{ADAM}{name}/"):
                 self.adam.state[parameter] = {k: v.to(parameter.device, copy=True) for k, v in moments.items()}
 
 

@@ -262,8 +262,7 @@ class TrainingViews:
 
     def load(self, state: State) -> None:
         """Resume where the whole state was taken; ValueError if it is of a run with other views."""
-        views = state.values["views"]
-        if views != len(self._scene.train):
+        if (views := state.values["views"]) != len(self._scene.train):
             raise ValueError(
                 f"the state is of a run with {views} training views, but scene {self._scene.name!r} has "
                 f"{len(self._scene.train)}; resume with the data it was trained on"
