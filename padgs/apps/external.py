@@ -166,7 +166,6 @@ class ExternalRun(LoadedRun):
         """Check that the Gaussians are in the world of the scene, see `check_frame`."""
         splats = self.method.model.splats
         opaque = splats.means[torch.sigmoid(splats.opacity_logits) >= OPAQUE].detach()
-
         known, nerfstudio = self.folder.parent / TRANSFORMS, None
         if known.is_file():
             shift = Similarity(translation=-self.scene.origin.double().cpu())
@@ -186,24 +185,20 @@ def open_model(
     `data` is the place to which the data of a run have moved; of a file it is a data set, or a run on it. `rays` and
     `transform` belong to a file, see `ExternalRun.open`; beside a run they are a ValueError.
     """
+    given = {"--data": data, "--rays": "" if rays == "exact" else rays, "--transform": transform}
+    opened_with = tuple(word for option, value in given.items() if value for word in (option, value))
     if not is_splat_file(path):
         if transform or rays != "exact":
             raise ValueError(f"{path} is a run, whose renderer and world are known; leave out --rays and --transform")
         if Path(path).is_file():
             raise ValueError(f"{path} is no {', '.join(SPLATS)}, and no folder of a run; give one of these")
-        return replace(load_run(path, data_path=data, device=device), opened_with=options_of(data, rays, transform))
+        return replace(load_run(path, data_path=data, device=device), opened_with=opened_with)
     config = None if data is None else config_of(data, device=device)
     run = ExternalRun.open(Path(path), config, rays, transform, device)
-    run.opened_with = options_of(data, rays, transform)
+    run.opened_with = opened_with
     if config is not None and not (found := run.check()).fits:
         run.notes += (str(found),)
     return run
-
-
-def options_of(data: str | None, rays: str, transform: str) -> tuple[str, ...]:
-    """Return the options of a command line that opens a model like `open_model` with these values."""
-    given = {"--data": data, "--rays": "" if rays == "exact" else rays, "--transform": transform}
-    return tuple(word for option, value in given.items() if value for word in (option, value))
 
 
 def scene_without_photographs(splats: Splats, file: Path) -> Scene:
@@ -258,10 +253,8 @@ class Renders:
                 if image.size != (view.width, view.height):
                     size = f"{image.width}x{image.height}"
                     other = f", or compare at --width {image.width}, with the photographs as --data"
-                    other = other if image.width == 2 * image.height else ""
-                    raise DataError(
-                        f"{path} is {size}; the test view is {view.width}x{view.height}: render that size{other}"
-                    )
+                    way_out = f"render that size{other if image.width == 2 * image.height else ''}"
+                    raise DataError(f"{path} is {size}; the test view is {view.width}x{view.height}: {way_out}")
                 if image.mode not in ("RGB", "L", "P", "1") or "transparency" in image.info:
                     raise DataError(f"{path} has pixels of type {image.mode}; save 8-bit RGB without transparency")
                 try:

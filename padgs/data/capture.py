@@ -24,10 +24,6 @@ FARTHEST = 1e15  # world units from the origin, the limit of renderers (`padgs.r
 OTHERS = "also present, not used"  # words of a note about files of other formats
 
 
-def silent(done: int, total: int) -> None:
-    """Show no progress."""
-
-
 class DataError(ValueError):
     """Unusable input. The message names the file, the rule and the way out; no traceback is needed."""
 

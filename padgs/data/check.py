@@ -13,7 +13,7 @@ import padgs.data
 from padgs.data import conventions
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
-from padgs.data.capture import Capture, DataError, DataOptions, Progress, listed, silent, view_name
+from padgs.data.capture import Capture, DataError, DataOptions, Progress, listed, view_name
 from padgs.data.cloud import GREY_POINTS
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
@@ -63,7 +63,7 @@ def check(
     format: str = "auto",
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     overlay: Path | None = None,
-    progress: Progress = silent,
+    progress: Progress = lambda done, total: None,
 ) -> Report:
     """Check a data set. Problems are collected in `Report.problems`; they raise nothing.
 

@@ -23,9 +23,8 @@ def optional_module(name: str, path: Path, extra: str = "scanners") -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise DataError(
-            f"{path} needs {name}, which cannot be imported ({error}); install it: {install_command(extra)}"
-        ) from error
+        needs = f"{name}, which cannot be imported ({error}); install it: {install_command(extra)}"
+        raise DataError(f"{path} needs {needs}") from error
 
 
 def _check_header(path: Path) -> None:

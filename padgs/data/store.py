@@ -72,8 +72,7 @@ def _weighted_sum(image: NDArray, index: NDArray[np.intp], weight: NDArray[np.fl
 
 def cache_root() -> Path:
     """Return the folder of all caches: $PADGS_CACHE, or ~/.cache/padgs."""
-    named = os.environ.get("PADGS_CACHE")
-    return Path(named) if named else Path.home() / ".cache" / "padgs"
+    return Path(os.environ.get("PADGS_CACHE") or Path.home() / ".cache" / "padgs")
 
 
 class Decodable(Protocol):

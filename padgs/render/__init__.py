@@ -14,6 +14,7 @@ from torch import Tensor
 from padgs.checks import check_known, lookup
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Pinhole
+from padgs.native import LIBRARIES, library_for
 from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap, summed_counters
 from padgs.render.ray_blocks import is_in_blocks, rasterize_blocks, seen
@@ -119,8 +120,6 @@ def resolve_backend(backend: str, means: Tensor) -> str:
     """Return the backend that `auto` selects for these tensors; other names are returned unchanged."""
     if backend != "auto":
         return backend
-    from padgs.native import LIBRARIES, library_for
-
     if library_for(means) is not None:
         return means.device.type
     if means.device.type in LIBRARIES and means.dtype == torch.float32:
@@ -130,8 +129,6 @@ def resolve_backend(backend: str, means: Tensor) -> str:
 
 @cache  # once in a process for each device, whatever the filters of the warnings module say
 def _warn_missing_library(device: torch.device) -> None:
-    from padgs.native import LIBRARIES
-
     try:
         LIBRARIES[device.type].require(device)
     except (OSError, RuntimeError) as error:

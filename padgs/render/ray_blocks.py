@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.camera import Camera, RayTable
+from padgs.render.backends.native import off_panorama
 from padgs.render.contract import ALPHA_MIN, Backend, Removals, Rendering, Request
 from padgs.render.cubemap import summed_counters
 from padgs.render.projection import camera_frame
@@ -24,11 +25,7 @@ SLACK = 1e-3  # radians, above the rounding of angles in float32
 
 def is_in_blocks(camera: Camera) -> bool:
     """Return whether a camera's image is drawn in blocks: a table of rays that are not learned, and no panorama's."""
-    if not isinstance(camera, RayTable) or camera.table.requires_grad:
-        return False
-    from padgs.render.backends.native import off_panorama
-
-    return off_panorama(camera.table) < 0
+    return isinstance(camera, RayTable) and not camera.table.requires_grad and off_panorama(camera.table) < 0
 
 
 def rasterize_blocks(rasterize: Backend, request: Request) -> Rendering:

@@ -169,7 +169,6 @@ class RunConfig(Settings):
 
         Stress, budget and warm start are left out if they are not used, so that they do not change the run id.
         """
-        stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
             **({"budget": budget} if (budget := self.budget.asked()) else {}),
             "data": asdict(self.data),
@@ -178,7 +177,7 @@ class RunConfig(Settings):
             "train": asdict(self.train),
             "protocol": {name: asdict(protocol) for name, protocol in self.protocols.items()},
             "run": asdict(self.run),
-            **stress,
+            **({"stress": asdict(self.stress)} if self.stress.title else {}),
             **({} if self.init is None else {"init": asdict(self.init)}),
             "variant": self.variant,
             "seed": self.seed,

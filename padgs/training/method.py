@@ -236,9 +236,8 @@ class Method(ABC):
             try:
                 check_camera(view.camera, self.render_config.options(scene_scale=1.0))
             except ValueError as error:
-                raise ValueError(
-                    f"{view.name} is a photograph beside panoramas: {error}; or set data.cameras=panoramas"
-                ) from error
+                why = f"{error}; or set data.cameras=panoramas"
+                raise ValueError(f"{view.name} is a photograph beside panoramas: {why}") from error
 
     @property
     def calibrates(self) -> bool:

@@ -8,7 +8,7 @@ import torch
 
 import padgs.data
 from padgs.data.assemble import assemble
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Progress, Tracks, silent, view_name
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Progress, Tracks, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
@@ -27,7 +27,7 @@ def convert(
     format: str = "auto",
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     known: KnownLength = KnownLength(),  # noqa: B008
-    progress: Progress = silent,
+    progress: Progress = lambda done, total: None,
 ) -> Scene:
     """Write a data set in the format `to` of `padgs.data.formats.writers.WRITERS`, and return the scene of the source.
 

@@ -68,9 +68,8 @@ class Json:
             return folder / name
         found = [folder / end for end in spellings(name) if is_inside(end) and (folder / end).is_file()]
         if not found and not is_inside(name):
-            raise DataError(
-                f"{self.where} names {name!r}; names must be relative and stay inside the folder: put it there"
-            )
+            rule = "names must be relative and stay inside the folder: put it there"
+            raise DataError(f"{self.where} names {name!r}; {rule}")
         return (found or [folder / name])[0]
 
     def numbers(self, *shape: int) -> Tensor:

@@ -44,13 +44,11 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side in ("train", "test"):
-        names = []
         for item in data[side].entries():
             name = item["rgb_file"].name()
             matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
             frames.append(Frame(name, images / name, poses.cam_from_pose(matrix.numbers(4, 4), matrix.where)))
-            names.append(name)
-        split[side] = tuple(names)
+        split[side] = tuple(item["rgb_file"].name() for item in data[side].entries())
     if twice := set(split["train"]) & set(split["test"]):
         raise DataError(f"{file}: {min(twice)} is both a train and a test view; keep it in one list")
     known = DATASETS["roam360"]

@@ -156,9 +156,8 @@ def _write_blob(blob: Any, path: Path, since: float) -> list[str]:
         write_atomically(path, data.tobytes())
         return []
     except OSError as error:
-        raise DataError(
-            f"cannot write {path} ({error.strerror or error}); move the E57 file where you may write"
-        ) from error
+        why = error.strerror or error
+        raise DataError(f"cannot write {path} ({why}); move the E57 file where you may write") from error
 
 
 def _turned() -> tuple[Reading, ...]:

@@ -75,9 +75,8 @@ def prepare(
         way_out = "the same command resumes" if place.is_dir() else "its folder cannot be made: choose another path"
         raise DataError(f"cannot prepare {destination} ({why}); {way_out}") from error
     except MemoryError as error:
-        raise DataError(
-            f"cannot prepare {destination} (out of memory); the same command with --threads 1 uses less, and resumes"
-        ) from error
+        way_out = "the same command with --threads 1 uses less, and resumes"
+        raise DataError(f"cannot prepare {destination} (out of memory); {way_out}") from error
     except RuntimeError as error:  # of pycolmap, its database included
         message = _pycolmap_message(error, place / "log.txt")
         raise DataError(

@@ -14,7 +14,7 @@ from PIL import Image
 
 from padgs.data import images as image_files
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
-from padgs.data.capture import Capture, DataError, Frame, Progress, listed, silent
+from padgs.data.capture import Capture, DataError, Frame, Progress, listed
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import SCENE_MASKS, Mask, find_masks, is_of_masks
@@ -47,7 +47,7 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_EXTENSIONS
 
 
-def extract_frames(video: Path, folder: Path, per_second: float, progress: Progress = silent) -> int:
+def extract_frames(video: Path, folder: Path, per_second: float, progress: Progress = lambda done, total: None) -> int:
     """Write the sharpest frame of every 1 / per_second seconds of a stitched video as frame_00001.jpg, ...; count them.
 
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
