@@ -138,7 +138,8 @@ def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda
             f"the target is {target.dtype} of {list(target.shape)}, the image {image.dtype} of {list(image.shape)}; "
             "give both alike"
         )
-    if len(devices := {str(tensor.device): None for tensor in (image, target, weight, total)}) > 1:
+    devices = {str(tensor.device): None for tensor in (image, target, weight, total)}
+    if len(devices) > 1:
         raise ValueError(f"image, target, weight and total are on {', '.join(devices)}; bring them to one device")
     height, width, _ = image.shape
     drawn, target = image.detach().contiguous(), target.contiguous()

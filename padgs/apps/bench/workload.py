@@ -86,7 +86,8 @@ class Workload:
 def build(size: Size, seed: int = 0) -> Workload:
     """Return anchors in directions uniform on the sphere; half of their Gaussians are selected."""
     generator = torch.Generator().manual_seed(seed)
-    count = max(1, round(size.gaussians / 5))  # half of ten each
+    per_anchor = 10 * 0.5
+    count = max(1, round(size.gaussians / per_anchor))
     pixel = 2 * math.pi / size.width
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     distance = NEAREST + (FURTHEST - NEAREST) * torch.rand(count, 1, generator=generator)

@@ -127,7 +127,8 @@ def _frame(image: Any, where: str, folder: Path, name: str, since: float, edited
     if not image.isDefined("sphericalRepresentation"):
         return None
     sphere = image["sphericalRepresentation"]
-    if (kind := next((kind for kind in ("jpegImage", "pngImage") if sphere.isDefined(kind)), None)) is None:
+    kind = next((kind for kind in ("jpegImage", "pngImage") if sphere.isDefined(kind)), None)
+    if kind is None:
         raise DataError(f"{where} has neither jpegImage nor pngImage; export the panoramas as JPEG")
     if not image.isDefined("pose") or not image.isDefined("pose/translation"):
         raise DataError(f"{where} has no pose; export the panoramas with poses, or run `padgs prepare` on the images")

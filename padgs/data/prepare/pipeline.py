@@ -45,7 +45,7 @@ Progress = Callable[[str, int, int], None]  # (one of STEPS, done, total)
 def prepare(
     source: Path,
     destination: Path,
-    options: PrepareOptions = PrepareOptions(),  # noqa: B008 - frozen dataclass
+    options: PrepareOptions | None = None,
     progress: Progress = lambda step, done, total: None,
 ) -> Prepared:
     """Compute poses and points of panoramas by structure from motion. Results are reproducible on one machine.
@@ -55,6 +55,7 @@ def prepare(
     masks if there are any, and prepare.json. A DataError names unusable input, panoramas without a relative pose, or a
     full disk; intermediate results then stay in the hidden folder, and nothing is written to the destination.
     """
+    options = options or PrepareOptions()
     work.check_options(source, options)
     if result := _existing(source, destination, options):
         return result
@@ -156,7 +157,8 @@ class _Job:
                 use = np.ones((image.height, image.width), bool) if mask is None else mask().numpy() >= 0.5
                 Image.fromarray(use * np.uint8(255)).save(masks / f"{short}.png", compress_level=1)
         if self.options.accurate:
-            if len(sizes := sorted({(image.width, image.height) for image in self.source.images.values()})) > 1:
+            sizes = sorted({(image.width, image.height) for image in self.source.images.values()})
+            if len(sizes) > 1:
                 found = f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sizes)})"
                 raise DataError(f"{found}; --accurate needs one: resize them, or omit it")
             mask_files = {short: masks / f"{short}.png" for short in self.files} if self.source.masks else {}
