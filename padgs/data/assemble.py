@@ -47,7 +47,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         unknown(0, 0)
     names = [frame.name for frame in capture.frames]
     if not names:
-        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+        way_out = "export the poses again, or run `padgs prepare IMAGES OUT`"
+        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image; {way_out}")
     if not panoramas:
         raise DataError(
             f"all {len(frames)} images of {capture.folder} are of other cameras ({frames[0].name}), which can be used "
@@ -211,7 +212,10 @@ def found_images(capture: Capture) -> Capture:
     found = {}  # stated name -> file
     for name in (frame.name for frame in capture.frames if frame.name not in there):
         files = next((meant[key] for key in spellings(name) if key in meant), set())
-        if len(files) == 1:
+        if len(files) > 1:
+            way_out = "remove all but one, set data.images to its folder, or name it with folder and extension"
+            raise DataError(f"{name!r} of the {capture.format} data set may be {listed(sorted(files))}; {way_out}")
+        if files:
             (found[name],) = files
     taken = Counter([*found.values(), *there])
     found = {name: file for name, file in found.items() if taken[file] == 1}

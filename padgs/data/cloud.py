@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, refuse_special
+from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, first_of, refuse_special
 from padgs.files import atomic_path
 from padgs.geometry.harmonics import DC
 
@@ -91,13 +91,21 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
     refuse_special(path)
     try:
         with path.open("rb") as file:
-            is_text = b"format ascii" in file.read(100)
+            head = file.read(100)
+        if not head:
+            raise DataError(f"{path} is empty (0 bytes); copy it again")
+        if not head.removeprefix(b"\xef\xbb\xbf").startswith(b"ply"):
+            way_out = "convert it to PLY, or give points as LAS, LAZ or E57, none of them compressed"
+            raise DataError(f"{path} is no PLY file, which begins with 'ply'; {way_out}")
+        is_text = b"format ascii" in head
         try:
             # Memory-mapped if binary: reading 500 000 Gaussians row by row takes minutes.
             data = PlyData.read(_plain_text(path) if is_text else str(path))
         except UnicodeDecodeError:
             data = PlyData.read(_plain_text(path))
         vertex = data["vertex"]
+    except DataError:
+        raise
     except FileNotFoundError as error:
         remedy = "set data.points to a PLY, LAS, LAZ or E57 file, or to random"
         raise DataError(f"the point cloud {path} does not exist; {remedy}") from error
@@ -201,4 +209,5 @@ def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
 
 def first_ply(folder: Path, names: tuple[str, ...]) -> Cloud | None:
     """Read the first of the named PLY files that exists in a folder; None if there is none."""
-    return next((read_ply(folder / name) for name in names if (folder / name).is_file()), None)
+    files = (first_of((folder / name).parent, (Path(name).name,)) for name in names)
+    return next((read_ply(file) for file in files if file), None)

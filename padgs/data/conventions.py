@@ -124,9 +124,12 @@ def small_images(panoramas: Iterable[NDArray[np.uint8]]) -> Tensor:
 
 def known_conventions() -> list[Convention]:
     """Return the stated convention first, then all that files of other programs are known to use."""
+    turned = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     corrections: dict[str, Callable[[Tensor], Tensor]] = {
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
+        # Of readers that turn y and z of the camera, which then are axes of the world.
+        "the matrices are camera from world: invert them": lambda p: turned @ torch.linalg.inv(p) @ turned,
         "the rotations are transposed: transpose them and keep the centres": lambda p: _with(
             p, -p[:, :3, :3].mT @ centers(p)[..., None], p[:, :3, :3].mT
         ),

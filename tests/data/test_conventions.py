@@ -41,6 +41,14 @@ MISREADINGS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     ),
     "x y z w": (lambda poses: _pose(_misread(poses), poses[:, :3, 3:]), "the quaternions are in the order x y z w"),
     "OpenGL inverse": (lambda poses: torch.linalg.inv(FLIP @ poses), "world from camera: invert them; camera axes"),
+    "OpenGL, camera from world": (
+        lambda poses: FLIP @ torch.linalg.inv(FLIP @ poses),
+        "the matrices are camera from world: invert them$",
+    ),
+    "OpenCV, camera from world": (
+        lambda poses: FLIP @ torch.linalg.inv(poses),
+        r"the matrices are camera from world: invert them; camera axes: use \(x, -y, -z\)",
+    ),
     "turned cloud": (lambda poses: poses @ Z_UP.T, r"different world frames: rotate the points, use \(x, z, -y\)"),
 }
 
@@ -83,7 +91,7 @@ def test_reprojection_errors_wrap_and_shrink_near_poles() -> None:
 
 def test_conventions_are_distinct() -> None:
     words = [convention.words for convention in known_conventions()]
-    assert len(set(words)) == len(words) == 6 * 48 + 47
+    assert len(set(words)) == len(words) == 7 * 48 + 47
 
 
 def _poses(world: World) -> Tensor:

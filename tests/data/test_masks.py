@@ -218,6 +218,40 @@ def test_the_only_value_besides_0_means_use_or_ignore(values: tuple[int, int], m
     torch.testing.assert_close(load(folder, mask="inverted").train[0].mask(), 1 - marked)
 
 
+@pytest.mark.parametrize("ids", [(33, 35), (1, 62, 171, 187, 190), (0, 7, 11, 23, 255), (1, 150)])
+def test_areas_of_labels_are_no_masks(ids: tuple[int, ...], folder: Path) -> None:
+    areas = np.repeat(np.array(ids, np.uint8), 13)[:64]
+    Image.fromarray(np.tile(np.pad(areas, (0, 64 - len(areas)), "edge"), (32, 1))).save(folder / "mask.png")
+    if ids == (0, 7, 11, 23, 255):  # three greys beside black and white may be weights
+        assert load(folder, mask="mask.png").train[0].mask() is not None
+        return
+    with pytest.raises(
+        DataError, match=rf"mask.png has areas of {ids[0]}, {ids[1]}.*, as images of labels have; .* 255"
+    ):
+        load(folder)
+
+
+@pytest.mark.parametrize("kind", ["ramp", "noise", "steps", "jpeg"])
+def test_soft_edges_and_weights_are_masks(kind: str, folder: Path) -> None:
+    row = np.linspace(0, 255, 64).astype(np.uint8)
+    random = np.random.default_rng(0).integers(1, 250, (32, 64)).astype(np.uint8)
+    steps = np.repeat(np.array([0, 85, 170, 255], np.uint8), 16)
+    pixels = {"ramp": np.tile(row, (32, 1)), "noise": random, "steps": np.tile(steps, (32, 1))}
+    pixels["jpeg"] = np.where(np.hypot(*np.mgrid[-16:16, -32:32]) < 20, np.uint8(0), np.uint8(255))
+    file = folder / ("mask.jpg" if kind == "jpeg" else "mask.png")
+    Image.fromarray(pixels[kind]).save(file, quality=30)
+    assert load(folder).train[0].mask() is not None
+
+
+def test_masks_that_are_not_used_are_named(folder: Path) -> None:
+    for name in ("masks", "mask"):
+        (folder / name).mkdir()
+    for file in ("masks/pano_00.png", "masks/pano_01_person.png", "mask/pano_00.png"):
+        _mask(folder / file)
+    (note,) = (note for note in load(folder).notes if note.startswith("masks: "))
+    assert note == "masks: masks/ for 1 of 6 views; not used: pano_01_person.png, mask/"
+
+
 @pytest.mark.parametrize("spec", ["auto", "inverted"])
 def test_labels_and_colours_are_no_masks(spec: str, folder: Path) -> None:
     _mask(folder / "mask.png")

@@ -109,7 +109,8 @@ def test_the_answers_of_the_readme(root, after_a_minute):
     assert f"{least} or more above published methods" in (root / "docs" / "index.md").read_text()
 
     answers = [
-        f"padgs+ on two of these four scenes, level with its rivals on `plaza`; {least} WS-PSNR or more above published",
+        f"padgs+ on two of these four scenes, level with its rivals on `plaza`; {least} WS-PSNR or more "
+        "above published methods",
         f"`spags_tuned`, with one sample, is {between(ahead, '.1f')} dB behind and draws a frame in "
         f"{frames[1]:.0f} ms, padgs+ in {frames[0]:.0f}",
         f"`spags_supersampled`, with four samples a pixel, is {between(sorted(ahead_of_samples)[1:], '.1f')} dB behind "
@@ -118,7 +119,8 @@ def test_the_answers_of_the_readme(root, after_a_minute):
         f"{-gains[scenes.index('plaza')]:.1f} on `plaza`",
         f"costs {between(at_poles, '.1f')} dB on all nine",
         f"{counts['bare room']:.0f} for a bare room, {between(furnished, '.0f')} for three furnished ones",
-        f"{counts['basement']:.0f} for a storey (`basement`), and {counts['near clutter']:.0f} and {counts['pole torture']:.0f} for rooms of",
+        f"{counts['basement']:.0f} for a storey (`basement`), and {counts['near clutter']:.0f} and "
+        f"{counts['pole torture']:.0f} for rooms of fine textures",
     ]
     answers[-2:] = [re.sub(r"(\d)(000)\b", r"\1 \2", answer) for answer in answers[-2:]]
     assert [answer for answer in answers if answer not in text] == [], "write these into the README"

@@ -3,7 +3,7 @@
 from fnmatch import fnmatch
 from pathlib import Path
 
-from padgs.data.capture import OTHERS, DataError, listed
+from padgs.data.capture import OTHERS, DataError, first_of, listed
 from padgs.data.formats.colmap import find_model
 from padgs.data.formats.metashape import find_xml, xml_files
 
@@ -66,6 +66,11 @@ def detect(path: Path) -> tuple[str, str]:
     return name, reason
 
 
+def _first_match(folder: Path, pattern: str) -> Path | None:
+    """Return the first file of a pattern in a folder; names without * and folders are in any case, as for readers."""
+    return first_of(folder, (pattern,)) or next(iter(sorted(folder.glob(pattern))), None)
+
+
 def _found(path: Path) -> dict[str, str]:
     """Return the formats that a folder or file may have, and what identifies each."""
     found: dict[str, str] = {}
@@ -77,6 +82,6 @@ def _found(path: Path) -> dict[str, str]:
         elif format == "metashape":
             if path.is_dir() and (xml := find_xml(path)):
                 found[format] = xml.name
-        elif files and all(there := [next(iter(sorted(path.glob(file))), None) for file in files]):
+        elif files and all(there := [_first_match(path, file) for file in files]):
             found.setdefault(format, " and ".join(file.relative_to(path).as_posix() for file in there if file))
     return found

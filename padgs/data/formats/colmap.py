@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, by_id, listed
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, by_id, files_with, first_of, listed
 from padgs.data.cloud import first_ply
 from padgs.data.formats import colmap_files as model_files
 from padgs.data.formats.colmap_lens import lens_of, pycolmap_module
@@ -28,7 +28,9 @@ def find_model(path: Path) -> Path | None:
 
     Beside the panoramas images.txt may be anything.
     """
-    for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
+    inside = first_of(path, ("colmap",), Path.is_dir)
+    places = [first_of(path, (name,), Path.is_dir) for name in ("sparse_equirectangular", "sparse")]
+    for folder in filter(None, (*places, inside and first_of(inside, ("sparse",), Path.is_dir), path)):
         parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
         files = {part: file for part in parts if (file := model_files.find_file(part, "images"))}
         if files and (folder != path or model_files.find_file(path, "cameras")):
@@ -39,7 +41,7 @@ def find_model(path: Path) -> Path | None:
 
 def _count(file: Path) -> int:
     """Return how many images the images file of a model says that it holds, without reading their poses."""
-    if file.suffix == ".txt":
+    if file.suffix.lower() == ".txt":
         return sum(line.strip().lower().endswith(EXTENSIONS) for line in read_lines(file, "replace"))
     with file.open("rb") as content:
         return int.from_bytes(content.read(8), "little")
@@ -88,7 +90,8 @@ def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) 
     if model != path and parts:
         others = listed(part.name for part in parts)
         notes.append(f"the model has several parts; the largest, {model.name}, is used, not {others}")
-    if double := [file.name for file in files.values() if file.suffix == ".bin" and file.with_suffix(".txt").is_file()]:
+    texts = {file.stem for file in files_with(model, ".txt")}
+    if double := [file.name for file in files.values() if file.suffix.lower() == ".bin" and file.stem in texts]:
         notes.append(f"the model is there as text and binary; {listed(double)} are used, not the text files")
     return notes
 
@@ -130,6 +133,11 @@ def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: 
     if is_named and camera.model not in pycolmap_module().CameraModelId.__members__:
         rule = "COLMAP has no such model; panoramas have EQUIRECTANGULAR: write that, if it is one"
         raise DataError(f"{where} has a {camera.model} camera; {rule}")
+    middle = camera.width / 2, camera.height / 2
+    if camera.model == "SPHERE" and camera.params[1:] != middle:
+        stated = " ".join(f"{number:g}" for number in camera.params[1:])
+        rule = "a SPHERE must have its middle there, {:g} {:g}: correct the line".format(*middle)
+        raise DataError(f"CX CY of the camera of {where} are {stated}; {rule}")
     lens = None if camera.model in model_files.PANORAMIC else partial(lens_of, camera, where)
     return Frame(name, folder / name, pose_of(image, where), camera.width, camera.height, lens=lens)
 

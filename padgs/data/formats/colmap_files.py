@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from padgs.data.capture import Cloud, DataError, by_id
+from padgs.data.capture import Cloud, DataError, by_id, first_of
 from padgs.data.cloud import color_bytes, whole_if_possible
 from padgs.data.images import read_bytes
 from padgs.data.splits import read_lines
@@ -36,7 +36,7 @@ class Camera:
     model: str  # its name, or "type ID" in binary files
     width: int
     height: int
-    params: tuple[float, ...] = ()  # of other cameras than panoramas
+    params: tuple[float, ...] = ()  # of a SPHERE and of cameras that are no panoramas
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,20 @@ class Points(NamedTuple):
 
 def find_file(model: Path, stem: str) -> Path | None:
     """Return a file of a model, binary or text; None if it has neither."""
-    return next((file for end in (".bin", ".txt") if (file := model / f"{stem}{end}").is_file()), None)
+    return first_of(model, (f"{stem}.bin", f"{stem}.txt"))
 
 
 def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
     """Read the cameras file: id and camera."""
-    if file.suffix == ".txt":
+    if file.suffix.lower() == ".txt":
         for number, line in _lines(file):
             words, kinds = line.split(), (int, str, int, int)
             key, model, width, height = _fields(file, number, words, kinds, "ID MODEL WIDTH HEIGHT")
             model = model.upper()
-            params = words[4:] if model not in PANORAMIC else []
+            names, params = "PARAMS", words[4:] if model not in PANORAMIC else []
             if model == "SPHERE":
-                _, *center = _fields(file, number, words[4:], (float,) * 3, "F CX CY after ID SPHERE WIDTH HEIGHT")
-                if center != [width / 2, height / 2]:
-                    raise DataError(f"{file}, line {number}: CX CY of a SPHERE are {center}; they must be its middle")
-            params = _fields(file, number, params, (float,) * len(params), "PARAMS after ID MODEL WIDTH HEIGHT")
+                names, params = "F CX CY", (words[4:] + 3 * [""])[:3]
+            params = _fields(file, number, params, (float,) * len(params), f"{names} after ID MODEL WIDTH HEIGHT")
             yield key, Camera(model, width, height, tuple(params))
         return
 
@@ -96,15 +94,17 @@ def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
 
 def read_images(file: Path) -> Iterator[Image]:
     """Read the images file. In text, the line of observations after an image may be empty or missing."""
-    if file.suffix == ".txt":
+    if file.suffix.lower() == ".txt":
         kinds, image = (int, *[float] * 7, int, str), None
         for number, line in _lines(file):
             seen = _observations(line) if image else None
+            points = "X Y POINT3D for each point of the image above, nor " if image else ""
             if image:
                 yield image if seen is None else replace(image, pixels=seen[:, :2], points=seen[:, 2].astype(np.int64))
                 image = None
             if seen is None:
-                fields = _fields(file, number, line.split(None, 9), kinds, "ID QW QX QY QZ TX TY TZ CAMERA NAME")
+                names = f"{points}ID QW QX QY QZ TX TY TZ CAMERA NAME"
+                fields = _fields(file, number, line.split(None, 9), kinds, names)
                 image = Image(fields[0], tuple(fields[1:8]), *fields[8:])
         if image:
             yield image
@@ -122,7 +122,7 @@ def read_images(file: Path) -> Iterator[Image]:
 def read_points(file: Path) -> Points:
     """Read the points file."""
     seen_by: set[int] = set()
-    if file.suffix == ".txt":
+    if file.suffix.lower() == ".txt":
         kinds, rows = (int, *[float] * 6), []
         for number, line in _lines(file):
             values, track = line.split()[:7], line.split()[8::2]
@@ -155,7 +155,7 @@ def read_frames(file: Path) -> dict[int, tuple[float, ...]]:
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines of a text file that are neither empty nor comments, with their numbers."""
-    errors = "surrogateescape" if file.stem == "images" else "replace"  # names are refused later, with advice
+    errors = "surrogateescape" if file.stem.lower() == "images" else "replace"  # names are refused later, with advice
     for number, line in enumerate(read_lines(file, errors), 1):
         if line.strip() and not line.strip().startswith("#"):
             yield number, line.strip()

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.data.capture import DataError, by_id, listed
+from padgs.data.capture import DataError, by_id, first_of, listed
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_name, is_inside, spellings
 
@@ -31,7 +31,8 @@ class Json:
     def __getitem__(self, key: str) -> Json:
         fields = self._of(Mapping, f"an object with the field {key!r}")
         if key not in fields:
-            raise DataError(f"{self.where} lacks the field {key!r}; it has {listed(fields) or 'none'}")
+            has = listed(fields) or "none"
+            raise DataError(f"{self.where} lacks the field {key!r}; it has {has}: add it, or export the file again")
         return Json(fields[key], f"{key} of {self.where}")
 
     def get(self, key: str) -> Json | None:
@@ -75,7 +76,7 @@ class Json:
     def numbers(self, *shape: int) -> Tensor:
         """Return nested numbers as a float64 tensor; a DataError if they are none, or of another shape than given."""
         if not _is_numbers(self.value):
-            raise DataError(f"{self.where} is not an array of numbers; texts, booleans and nulls are none")
+            raise DataError(f"{self.where} is not an array of numbers; write numbers, without quotes")
         try:
             tensor = torch.tensor(self.value, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -87,7 +88,9 @@ class Json:
     def _of(self, kind: type | tuple[type, ...], words: str) -> Any:
         """Return the value if it has this type, else refuse it."""
         if not isinstance(self.value, kind):
-            raise DataError(f"{self.where} must be {words}, not {type(self.value).__name__}")
+            shown = "" if isinstance(self.value, (Mapping, list)) else f" {self.value!r}"
+            kind_of = f"{type(self.value).__name__}{shown}"
+            raise DataError(f"{self.where} must be {words}, not {kind_of}; correct it, or export the file again")
         return self.value
 
 
@@ -112,4 +115,4 @@ def read_json(path: Path) -> Json:
 
 def file_in(path: Path, name: str) -> Path:
     """Return the file that describes a data set; `path` is its folder or the file itself."""
-    return path if path.is_file() else path / name
+    return path if path.is_file() else first_of(path, (name,)) or path / name

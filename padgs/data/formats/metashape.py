@@ -33,8 +33,8 @@ def find_xml(path: Path) -> Path | None:
 
 
 def xml_files(path: Path) -> list[Path]:
-    """Return the XML files in a folder that have a chunk."""
-    return [file for file in files_with(path, ".xml") if b"<chunk" in file.read_bytes()[:4096]]
+    """Return the XML files in a folder that have a chunk; in UTF-16 every second byte is 0."""
+    return [file for file in files_with(path, ".xml") if b"<chunk" in file.read_bytes()[:8192].replace(b"\0", b"")]
 
 
 def read(path: Path, options: DataOptions) -> Capture:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from padgs.data.capture import FARTHEST, DataError
 
+REMEDY = "remove the image or compute its pose again"
 TOLERANCE = 1e-3  # of R R^T - I; accepts files with four digits, refuses scaled or sheared matrices
 
 # `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
@@ -40,7 +41,7 @@ def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
     if matrix.dim() != 2 or matrix.shape[0] not in (3, 4) or matrix.shape[1] != 4:
         raise DataError(f"{where}: a pose has the shape {list(matrix.shape)}; it must be 4x4 (or 3x4)")
     if matrix.shape[0] == 4:
-        _finite(matrix, where)
+        _refuse_zeros(_finite(matrix, where)[:3, :3], where)
         if torch.allclose(matrix[:3, 3], torch.zeros(3, dtype=torch.float64)) and matrix[3, :3].abs().max() > 1e-9:
             found = f"the pose is transposed, its last row {_numbers(matrix[3])} holds the translation"
             raise DataError(f"{where}: {found}; write it with the translation in the last column")
@@ -66,7 +67,7 @@ def cam_from_panorama(quaternion: Tensor, center: Tensor, where: str) -> Tensor:
 def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     """Return the rotation [3, 3] of a quaternion (w, x, y, z), which must have unit length up to rounding."""
     quaternion = _finite(quaternion, where)
-    length = quaternion.norm().item()
+    length = _refuse_zeros(quaternion, where).norm().item()
     if abs(length - 1) > 0.01:
         raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1: divide it by that")
     w, x, y, z = (quaternion if abs(length - 1) < 1e-12 else quaternion / length).tolist()
@@ -90,7 +91,7 @@ def checked_rotation(rotation: Tensor, where: str) -> Tensor:
 
     A DataError says that it is not finite, scaled, left-handed or not orthogonal.
     """
-    rotation = _finite(rotation, where)
+    rotation = _refuse_zeros(_finite(rotation, where), where)
     if rotation.shape != (3, 3):
         raise DataError(f"{where}: a rotation has the shape {list(rotation.shape)}; it must be 3x3")
     gram = rotation @ rotation.T
@@ -111,14 +112,20 @@ def checked_rotation(rotation: Tensor, where: str) -> Tensor:
     return left @ right
 
 
+def _refuse_zeros(rotation: Tensor, where: str) -> Tensor:
+    """Return a rotation in any form; a DataError if it is 0, as programs write it for images without a pose."""
+    if rotation.numel() and rotation.abs().max() < 1e-6:
+        raise DataError(f"{where}: the rotation is all zeros, so the image has no pose; {REMEDY}")
+    return rotation
+
+
 def _finite(values: Tensor, where: str) -> Tensor:
     values = torch.as_tensor(values, dtype=torch.float64)
-    remedy = "remove the image or compute its pose again"
     if not values.isfinite().all():
-        raise DataError(f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; {remedy}")
+        raise DataError(f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; {REMEDY}")
     if (far := values[values.abs() > FARTHEST]).numel():
         rule = f"nothing farther than {FARTHEST:g} from the origin can be rendered"
-        raise DataError(f"{where}: the pose contains {_numbers(far[:1])}; {rule}: {remedy}")
+        raise DataError(f"{where}: the pose contains {_numbers(far[:1])}; {rule}: {REMEDY}")
     return values
 
 

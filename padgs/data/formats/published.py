@@ -38,7 +38,7 @@ _BODY_FROM_CAMERA = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=tor
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
     """Read poses, split and points of a 360Roam scene."""
-    file = path / "pose_c2w.json"
+    file = file_in(path, "pose_c2w.json")
     data = read_json(file)
     images = image_folder(path, options.images)
     frames: list[Frame] = []
@@ -118,7 +118,7 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
 
 def read_tartanair(path: Path, options: DataOptions) -> Capture:
     """Read poses and depth maps of a scene of TartanAir-V2, as COLMAP packs it."""
-    images, file = image_folder(path, options.images), path / "poses.txt"
+    images, file = image_folder(path, options.images), file_in(path, "poses.txt")
     frames = []
     for index, line in enumerate(read_lines(file), start=1):
         if not line.strip():

@@ -16,6 +16,7 @@ import torch
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Reading, files_with, listed
 from padgs.data.cloud import joined, read_cloud
+from padgs.data.formats.json_file import file_in
 from padgs.data.formats.poses import cam_from_panorama, rigid
 from padgs.data.scans import open_e57
 from padgs.data.splits import check_name, read_lines
@@ -26,8 +27,8 @@ COLUMNS = ("pano_pos_x", "pano_pos_y", "pano_pos_z", "pano_ori_w", "pano_ori_x",
 
 def read_navvis(path: Path, options: DataOptions) -> Capture:
     """Read `pano-poses.csv` and a cloud; a DataError names the line that lacks a column or is not valid."""
-    file = path if path.is_file() else path / "pano-poses.csv"
-    file = file if path.is_file() or file.exists() else path / "pano" / "pano-poses.csv"
+    file = file_in(path, "pano-poses.csv")
+    file = file if file.exists() else file_in(path / "pano", "pano-poses.csv")
     lines = [(number, line) for number, line in enumerate(read_lines(file), 1) if line.strip()]
     if not lines:
         raise DataError(f"{file} holds no header; it must begin with '# pano poses v1.0: ID; filename; timestamp; ...'")

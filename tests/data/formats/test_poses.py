@@ -59,7 +59,7 @@ def test_rounded_rotations_are_accepted_and_repaired() -> None:
         (2.0 * torch.eye(3), "here: the pose holds a rotation times 2"),
         (torch.diag(torch.tensor([1.0, 1.0, -1.0])), r"here: the pose is left-handed \(determinant -1"),
         (torch.tensor([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]), "here: the 3x3 part of the pose is not a rotation"),
-        (torch.zeros(3, 3), "not a rotation"),
+        (torch.zeros(3, 3), "here: the rotation is all zeros, so the image has no pose; remove the image"),
         (torch.full((3, 3), math.nan), "here: the pose contains nan"),
         (torch.tensor([[math.inf, 0, 0], [0, 1, 0], [0, 0, 1]]), "contains inf"),
         (torch.eye(2), r"shape \[2, 2\]; it must be 3x3"),
@@ -70,8 +70,13 @@ def test_invalid_rotations_are_refused(matrix: torch.Tensor, message: str) -> No
         checked_rotation(matrix, "here")
 
 
+def test_a_matrix_of_zeros_is_no_pose() -> None:
+    with pytest.raises(DataError, match="here: the rotation is all zeros, so the image has no pose"):
+        cam_from_pose(torch.zeros(4, 4), "here")
+
+
 def test_quaternions_of_another_length() -> None:
-    with pytest.raises(DataError, match="here: the quaternion has the length 0; it must be 1"):
+    with pytest.raises(DataError, match="here: the rotation is all zeros, so the image has no pose"):
         rotation_from_quaternion(torch.zeros(4), "here")
     with pytest.raises(DataError, match="the length 2; it must be 1"):
         rotation_from_quaternion(torch.tensor([2.0, 0, 0, 0]), "here")
