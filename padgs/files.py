@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
 import shutil
 import socket
 import struct
@@ -27,6 +28,15 @@ MAX_PIXELS = 180_000_000  # a panorama of 18972x9486
 
 DRAFT = ".padgs-draft-"  # begins the names of files and folders that are not complete
 DAY = 86400.0  # seconds
+
+
+def file_name(text: str) -> str:
+    """Return a text as a file name without separators; letters of all languages stay, since names may differ in them.
+
+    >>> file_name("left/R001 a"), file_name("chart_../../etc"), file_name("客厅 1")
+    ('left-R001-a', 'chart_..-..-etc', '客厅-1')
+    """
+    return re.sub(r"[^\w.-]+", "-", text)
 
 
 @contextmanager
@@ -52,6 +62,8 @@ def draft_of(path: Path) -> Iterator[Path]:
 
     Drafts that killed processes left in this folder, and that have not changed for a day, are removed first.
     """
+    if not path.name:
+        raise ValueError(f"{path} is the working folder or a root, which is not replaced; name a new one")
     with suppress(OSError):
         for left in path.parent.glob(f"{DRAFT}*"):
             if time.time() - left.lstat().st_mtime > DAY:

@@ -14,7 +14,7 @@ from types import NoneType
 from typing import Any
 
 from padgs.checks import typed
-from padgs.files import read_regular, write_atomically
+from padgs.files import file_name, read_regular, write_atomically
 
 STATUSES = {
     "ok": "trained to the end and evaluated",
@@ -165,15 +165,6 @@ def log_lines(run_folder: Path) -> Iterator[dict[str, Any]]:
         yield entry
 
 
-def file_name(text: str) -> str:
-    """Return a text as a file name without separators; letters of all languages stay, since names may differ in them.
-
-    >>> file_name("left/R001 a"), file_name("chart_../../etc"), file_name("客厅 1")
-    ('left-R001-a', 'chart_..-..-etc', '客厅-1')
-    """
-    return re.sub(r"[^\w.-]+", "-", text)
-
-
 def picture_name(view: str) -> str:
     """Return the file name of the image of a test view, in `renders` of a run.
 
@@ -260,7 +251,8 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
         result = replace(typed(Result, document), scores=scores)
         _refuse_impossible(result)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise ResultError(f"{where}: {str(error):.300}; delete it and run again") from error
+        why = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise ResultError(f"{where}: {why:.300}; delete it and run again") from error
     if edited:
         raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
     names = [result.run, result.method, result.preset, *result.experiments, *result.scores]

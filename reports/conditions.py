@@ -5,12 +5,12 @@ from collections.abc import Iterable, Iterator, Mapping
 import pandas as pd
 from pandas import DataFrame
 
+from padgs.files import file_name
 from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, by_conditions
 from padgs.reports.measures import PROTOCOL_METRICS
 from padgs.reports.methods import name, title
 from padgs.reports.selection import Mixture, Request
 from padgs.reports.table import UNRANKED
-from padgs.results import file_name
 
 # Columns of the frame; "protocol" means the rules of all protocols, since tables show numbers of several.
 OF_A_DATA_SET = ("protocol", "resolution", "length", "learning_rates")  # scenes may differ, rules may not

@@ -16,6 +16,7 @@ from typing import Any
 import pandas as pd
 from pandas import DataFrame
 
+from padgs.files import file_name
 from padgs.reports import methods
 from padgs.reports.charts.drawing import Chart, figure, lay_out, styled
 from padgs.reports.conditions import footnotes, refuse_mixture
@@ -23,7 +24,6 @@ from padgs.reports.frame import CONFIG, by_conditions, grouped
 from padgs.reports.selection import RunSet, one_setting, refuse_differences
 from padgs.reports.significance import failures, mean_cell
 from padgs.reports.table import Block, Cell, Column, Row, Table
-from padgs.results import file_name
 
 CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
 PROTOCOL = "stability"

@@ -50,7 +50,7 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
     """
     if source.is_file():
         lines = enumerate(results.file_content(source).splitlines(), start=1)
-        loads = {f"{source}:{number}": partial(_from_line, line) for number, line in lines}
+        loads = {f"{source}:{number}": partial(_from_line, line) for number, line in lines if line.strip()}
     else:
         distinct: dict[Path, Path] = {}  # without links to runs beside them
         found = source.glob(f"*/{results.FILE_NAME}")

@@ -11,11 +11,10 @@ from typing import Any
 from pandas import DataFrame
 from PIL import Image
 
-from padgs.files import write_atomically
+from padgs.files import file_name, write_atomically
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.significance import BEST, marks
 from padgs.reports.table import Table
-from padgs.results import file_name
 
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}

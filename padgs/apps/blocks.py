@@ -26,6 +26,7 @@ import padgs.data
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions
 from padgs.data.depths import write_depths
+from padgs.data.formats.json_file import read_json
 from padgs.data.formats.transforms import REDUCED
 from padgs.data.formats.writers import Content, write_transforms
 from padgs.data.masks import write_masks
@@ -339,9 +340,12 @@ def _block_of(run: LoadedRun) -> dict[str, Any]:
             f"{run.folder} is of no block: {folder / BLOCK} is missing; train what padgs split wrote, or, if it has "
             "moved, name the folder of the blocks with --data"
         )
-    block = json.loads((folder / BLOCK).read_text())
-    if hashlib.sha256((folder.parent / REGIONS).read_bytes()).hexdigest() != block.get("regions"):
-        raise ValueError(f"{folder.parent / REGIONS} is not that of {folder}; split the data set again")
+    described, regions = read_json(folder / BLOCK), folder.parent / REGIONS
+    block: dict[str, Any] = {key: described[key].whole() for key in ("number", "count")}
+    block |= {key: described[key].text() for key in ("source", "format", "regions")}
+    block["options"] = {key: option.value for key, option in described["options"].items().items()}
+    if not regions.is_file() or hashlib.sha256(regions.read_bytes()).hexdigest() != block["regions"]:
+        raise ValueError(f"{regions} is missing, or not that of {folder}; split the data set again")
     run.refuse_other_data()
     return block
 

@@ -20,7 +20,7 @@ from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import CONVERTED, read_splats
 from padgs.apps.frame_check import FrameCheck, check_frame, nerfstudio_similarity, read_transform
 from padgs.checks import unknown
-from padgs.data.capture import DataError, listed
+from padgs.data.capture import FARTHEST, DataError, listed
 from padgs.data.formats.path_file import TRANSFORMS
 from padgs.data.formats.transforms import transforms_file
 from padgs.data.perturb import StressOptions
@@ -132,8 +132,10 @@ class ExternalRun(LoadedRun):
             raise DataError(f"{file} has no Gaussians; export it again")
         rows = splats.rows()
         finite = torch.stack([values.isfinite().reshape(len(splats), -1).all(1) for values in rows.values()])
-        if not (kept := finite.all(0)).all():
-            notes.append(f"{int((~kept).sum())} Gaussians have values that are not finite, and are left out")
+        in_range = splats.log_scales.exp().isfinite().all(1) & (splats.means.abs() <= FARTHEST).all(1)
+        if not (kept := finite.all(0) & in_range).all():
+            what = f"values that are not finite, or beyond {FARTHEST:g}"
+            notes.append(f"{int((~kept).sum())} Gaussians have {what}, and are left out")
             splats.load({name: values[kept] for name, values in rows.items()})
         if not len(splats):
             raise DataError(f"{file} has no Gaussians with finite values; export it again")

@@ -1,5 +1,6 @@
 """`padgs score`: Gaussians or renders of another program, scored like a run."""
 
+import shlex
 import sys
 from typing import Annotated
 
@@ -75,4 +76,4 @@ def score(
     show_result(result, folder, console)
     if not path.is_dir():
         show(f"rendered by padgs with --rays {rays}")
-    show(f"next: padgs report runs {to}", sys.stdout)
+    show(f"next: {shlex.join(('padgs', 'report', 'runs', to))}", sys.stdout)

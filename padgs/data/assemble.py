@@ -21,6 +21,7 @@ from padgs.data.masks import find_masks, masks_beside
 from padgs.data.metres import unit_note
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage, cache_root
+from padgs.files import file_name
 from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
@@ -184,15 +185,15 @@ def file_names(folder: Path) -> list[str]:
 
 
 def refuse_clashes(names: Sequence[str]) -> None:
-    """Refuse images whose views would have one name: names that differ only in case or extension."""
+    """Refuse images whose views would share a file: names that differ only in case, extension, or signs such as /."""
     seen: dict[str, str] = {}
     for name in names:
-        key = view_name(name).casefold()
+        key = file_name(view_name(name)).casefold()
         if seen.get(key) == name:
             raise DataError(f"the image {name!r} has two poses; remove one")
         if key in seen:
             both = f"{seen[key]!r} and {name!r}"
-            raise DataError(f"the images {both} would share one name (without case and extension); rename one")
+            raise DataError(f"the images {both} would share one name (without case, extension and signs); rename one")
         seen[key] = name
 
 
@@ -208,10 +209,10 @@ def found_images(capture: Capture) -> Capture:
     for file in image_names(folder):
         whole, *without = spellings(file)
         for key in (whole, *without[:1]):
-            meant.setdefault(key, set()).add(file)
+            meant.setdefault(key.casefold(), set()).add(file)
     found = {}  # stated name -> file
     for name in (frame.name for frame in capture.frames if frame.name not in there):
-        files = next((meant[key] for key in spellings(name) if key in meant), set())
+        files = next((meant[key] for key in spellings(name.casefold()) if key in meant), set())
         if len(files) > 1:
             way_out = "remove all but one, set data.images to its folder, or name it with folder and extension"
             raise DataError(f"{name!r} of the {capture.format} data set may be {listed(sorted(files))}; {way_out}")
@@ -230,8 +231,8 @@ def found_images(capture: Capture) -> Capture:
         return capture
     stated, file = next(iter(found.items()))
     note = (
-        f"images: {len(found)} names differ from their files in folders, extension or Unicode form: {stated!r} is "
-        f"{os.path.relpath(folder / file, capture.folder)}"
+        f"images: {len(found)} names differ from their files in folders, extension, case or Unicode form: "
+        f"{stated!r} is {os.path.relpath(folder / file, capture.folder)}"
     )
     names = {frame.name: found.get(frame.name, frame.name) for frame in capture.frames}
     frames = (replace(frame, name=names[frame.name], image=folder / names[frame.name]) for frame in capture.frames)
@@ -258,18 +259,15 @@ def _refuse_missing(capture: Capture) -> None:
     absent = [frame.name for frame in capture.frames if not frame.image.is_file()]
     if not absent:
         return
-    present = {name.casefold(): name for name in image_names(capture.image_folder)}
-    hint = next((present[name.casefold()] for name in absent if name.casefold() in present), None)
+    unreadable = next((name for name in image_names(capture.image_folder) if name in absent), None)
     remedy = "set data.images to the folder that holds them, or name the others in train.txt and test.txt"
     last_names = {PurePosixPath(name).name for name in absent}
     elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).name in last_names), None)
     above = [image_folder(folder, None) for folder in list(capture.folder.absolute().parents)[:3]]
     if outside := next((folder for folder in above if (folder / absent[0]).is_file()), None):
         remedy = f"set data.images to {os.path.relpath(outside, capture.folder)}, which holds {absent[0]}"
-    if hint in absent:
-        remedy = f"{hint!r} is a pipe, a device or a broken link: put the image in its place"
-    elif hint:
-        remedy = f"there is {hint!r}, which differs in case: rename it"
+    if unreadable:
+        remedy = f"{unreadable!r} is a pipe, a device or a broken link: put the image in its place"
     elif elsewhere:
         remedy = f"{capture.folder / elsewhere} has the name of one: set data.images to the folder that holds them"
     lost = f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}"

@@ -83,19 +83,20 @@ def best_reading(capture: Capture) -> Capture:
         return replace(capture, readings=())
     cloud, best, notes = capture.cloud, readings[0], list(capture.notes)
     if len(readings) > 1:
-        some, fits = panoramas[:: max(1, len(panoramas) // VIEWS)][:VIEWS], [0.0]
+        some, fits, tested = panoramas[:: max(1, len(panoramas) // VIEWS)][:VIEWS], [0.0], "not tested by colours"
         poses = torch.stack([frame.cam_from_world for frame in some])
         with suppress(DataError, ValueError):  # missing and damaged images, and other shapes, are reported later
             if cloud and (colors := cloud.colors) is not None:
                 images = small_images(decode(frame.image) for frame in some)
                 fits = [colour_fit(one.axes @ poses, images, _moved(cloud.points, one), colors) for one in readings]
+                tested = f"colours agree by {max(fits):.2f} at most, so the poses may be wrong: run padgs check"
         if max(fits) > max(MIN_CORRELATION, fits[0] + MIN_GAIN):
             best = readings[fits.index(max(fits))]
         why = f"colours agree by {max(fits):.2f}"
         if max(fits) <= MIN_CORRELATION:
             points = cloud.points if cloud else torch.zeros(0, 3)
             inside = [_share_inside(one.axes @ poses, _moved(points, one)) for one in readings]
-            best, why = readings[inside.index(max(inside))], "not tested by colours"
+            best, why = readings[inside.index(max(inside))], tested
         notes.append(f"{best.words}: {why}")
     frames = (replace(frame, cam_from_world=best.axes @ frame.cam_from_world) for frame in capture.frames)
     cloud = cloud and replace(cloud, points=_moved(cloud.points, best))

@@ -106,6 +106,8 @@ def crop_of(image: Image.Image, path: object, within: Crop | None = None) -> Cro
     if all(text is None for text in texts.values()):
         is_same = within and max(abs(image.width - within.width), abs(image.height - within.height)) <= 1
         return within if is_same else None
+    if all(text is None for name, text in texts.items() if "Full" not in name) and image.width == 2 * image.height:
+        return None  # a whole panorama, resized
     said = ", ".join(f"{name} {text}" for name, text in texts.items() if text is not None)
     contradiction = f"{path} contradicts itself: it is {image.width}x{image.height} and says {said}; {_REMOVE}"
     usual = (image.width, image.height, image.width, image.height, 0, 0)

@@ -124,6 +124,11 @@ def spellings(name: str) -> Iterator[str]:
             yield end.rpartition(".")[0]
 
 
+def _keys(name: str) -> list[str]:
+    """Return `spellings` in one case and without outer spaces, which lists drop; no two names differ in these alone."""
+    return [key.strip() for key in spellings(name.casefold())]
+
+
 def _every(names: Names, every: int, mode: str) -> Split:
     test = tuple(range(0, len(names), every))
     if not (train := tuple(i for i in range(len(names)) if i % every)):
@@ -139,21 +144,21 @@ def _resolve(lines: Names, names: Names, which: str, unposed: Names, left_out: N
     meant: dict[str, set[int]] = {}
     known = (*names, *left_out)
     for i, name in enumerate(known):
-        for key in spellings(name):
+        for key in _keys(name):
             meant.setdefault(key, set()).add(i)
-    meant |= {normalize("NFC", name): {i} for i, name in enumerate(known)}
+    meant |= {_keys(name)[0]: {i} for i, name in enumerate(known)}
     chosen: set[int] = set()
     absent: list[str] = []
     for line in lines:
-        found = next((meant[key] for key in spellings(line) if key in meant), set())
+        found = next((meant[key] for key in _keys(line) if key in meant), set())
         if len(found) > 1:
             matches = listed(known[i] for i in sorted(found))
             raise DataError(f"the {which} names {line!r}, which matches {matches}; be specific")
         if not found:
             absent.append(line)
         chosen |= found
-    there = {key for name in unposed for key in spellings(name)}
-    if without := [line for line in absent if there & set(spellings(line))]:
+    there = {key for name in unposed for key in _keys(name)}
+    if without := [line for line in absent if there & set(_keys(line))]:
         raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
     if absent:
         rule = f"a line is one name, and the data set has {listed(names)}"

@@ -26,6 +26,7 @@ from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")
+LONGEST_VARIANT = 150  # letters; what a run adds to it must fit into the names of results
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,8 @@ class Settings:
     def __post_init__(self) -> None:
         check_known(self, retry=RETRIES, smallest=("off", "on"))
         check(self, "in [0, 2^63)", lambda seed: 0 <= seed < 2**63, "seed")
+        if len(self.variant) > LONGEST_VARIANT:
+            raise ValueError(f"variant has {len(self.variant)} letters; give at most {LONGEST_VARIANT}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from padgs import results
@@ -164,7 +165,8 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         if store.path.is_file():
             found = f"{folder} is a file"
         elif (store.path / results.FILE_NAME).is_file() and not settings.is_file():
-            found = f"{folder} has the scores of another program's model, which is opened by its own file"
+            what = "the same padgs-run restores it; another program's model is opened by its own file"
+            found = f"{folder} has scores and no {settings.name}: {what}"
         raise RunFolderError(f"{found}; give the folder of one run, as padgs-run names it at its end")
     try:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
@@ -175,7 +177,7 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         values["run"]["device"] = device
         if values["render"]["backend"] in missing_backends(device):
             values["render"]["backend"] = "auto"
-    except (YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (YAMLError, OmegaConfBaseException, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RunFolderError(f"{settings} is not a configuration of padgs-run ({error}); restore it") from error
     try:
         config = config_from_values(values)

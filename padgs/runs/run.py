@@ -85,6 +85,8 @@ def run(
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
         if (code := distribution(config.method)) and not result.code_version.endswith(code):
             advice += f"; it was trained by other code of the method ({result.code_version}): delete it to train again"
+        if not store.config.exists():
+            store.prepare(config.values())
         say(words, f"finished before, nothing to do{advice}")
         show_result(result, store.path, words)
         return result

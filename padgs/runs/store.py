@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from padgs.runs.config import RunConfig
 
 PROGRESS = "progress"  # key of `Progress` in a checkpoint
-LONGEST_WORD = 48  # letters of a scene or variant in a folder's name, which may have 255 bytes
+LONGEST_WORD, LONGEST_BYTES = 48, 90  # letters and bytes of a scene or variant in the name of a folder, of 255 bytes
 LOCK, OWNER = ".lock", ".owner.json"
 
 
@@ -246,8 +246,9 @@ def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str 
     digest = hashlib.sha256(f"{config_hash(values)}|{fingerprint}".encode()).hexdigest()
     stress = "-".join(map(str, values.get("stress", {}).values()))
     words = [scene, preset or values["method"]["name"], values["variant"], stress]
-    readable = [re.sub(r"(?:[^\w.-]|_)+", "-", normalize("NFC", word))[:LONGEST_WORD].strip("-.") for word in words]
-    return "_".join([*(word for word in readable if word), digest[:10]])
+    readable = [re.sub(r"(?:[^\w.-]|_)+", "-", normalize("NFC", word))[:LONGEST_WORD] for word in words]
+    short = [word.encode()[:LONGEST_BYTES].decode(errors="ignore").strip("-.") for word in readable]
+    return "_".join([*filter(None, short), digest[:10]])
 
 
 @dataclass(frozen=True)

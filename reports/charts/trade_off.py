@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import pandas as pd
 from pandas import DataFrame
 
+from padgs.files import file_name
 from padgs.reports import methods, published
 from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets
 from padgs.reports.frame import by_place, without_data
@@ -15,7 +16,6 @@ from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, one_setting, settings
 from padgs.reports.significance import failure_notes, over_scenes
 from padgs.reports.table import Cell
-from padgs.results import file_name
 
 FEWEST = 3  # methods in a chart of equal time
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")

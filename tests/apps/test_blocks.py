@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import padgs.data
 from padgs import results
 from padgs.apps import blocks
-from padgs.apps.blocks import bisect, merge
+from padgs.apps.blocks import BLOCK, REGIONS, bisect, merge
 from padgs.cli.commands import app
 from padgs.data.assemble import assemble
 from padgs.data.capture import Capture, Cloud, DataOptions, Frame, Tracks
@@ -230,6 +230,15 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
     assert "whose parts share parameters" in error(trained(parts[0], tmp_path, "method=padgs"), runs[1])
     assert "has other settings of method" in error(runs[0], trained(parts[1], tmp_path, "method.sh_degree=1"))
     assert "name the folder of the blocks with --data" in error(trained(source, tmp_path), runs[1])
+    text = (described := parts[0] / BLOCK).read_text()
+    damages = {"": "block.json is empty", "{": "is not valid JSON", "[1]": "must be an object", "{}": "lacks the field"}
+    for damage, words in damages.items():
+        described.write_text(damage)
+        assert words in error(*runs) and "block.json" in error(*runs)
+    described.write_text(text)
+    (kept := parts[0].parent / REGIONS).rename(kept.with_name("moved"))
+    assert "regions.npz is missing, or not that of" in error(*runs) and "split the data set again" in error(*runs)
+    kept.with_name("moved").rename(kept)
     copy = shutil.copytree(runs[0], tmp_path / "copy")
     results.write(replace(results.read(copy / "result.json"), status="nan", reason="x"), copy)
     assert "did not end well" in error(str(copy), runs[1])

@@ -266,10 +266,12 @@ def test_gaussians_are_shown_without_a_data_set(splats, tmp_path, generator):
     broken = random_splats(0, generator)
     broken.means.data[0] = float("nan")
     broken.opacity_logits.data[1] = float("inf")  # an opacity of 1 in 8 bits
+    broken.log_scales.data[2] = 100.0
     write_splats(tmp_path / "a.ply", broken)
     opened = open_model(str(tmp_path / "a.ply"), device="cpu")
-    assert isinstance(opened, ExternalRun) and len(opened.method.model.splats) == len(broken) - 1
-    assert opened.notes == ("1 Gaussians have values that are not finite, and are left out",)
+    assert isinstance(opened, ExternalRun) and len(opened.method.model.splats) == len(broken) - 2
+    what = "values that are not finite, or beyond 1e+15, and are left out"
+    assert opened.notes == (f"2 Gaussians have {what}",)
     shown = padgs_command("render", tmp_path / "a.ply", *arguments[2:], "--to", tmp_path / "g")[1]
     assert opened.notes[0] in shown
 

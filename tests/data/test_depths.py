@@ -87,8 +87,12 @@ def test_ob3d(depths: bool, world: World, tmp_path: Path):
     else:
         assert view.load_depth is None
     (folder / "train.txt").write_text("7\n")
-    with pytest.raises(DataError, match="train.txt names 00007, which have no camera"):
+    with pytest.raises(DataError, match="the train list .* images that do not exist: '00007_rgb.png'"):
         load(folder)
+    (folder / "train.txt").unlink()
+    (folder / "Train.txt").write_text("0\nimages/00002_rgb.png\n00003_rgb\n")
+    (folder / "cameras" / "._00000_cam.json").write_bytes(b"\0\5\x16\7")  # of macOS
+    assert [view.name for view in load(folder).train] == ["00000_rgb", "00002_rgb", "00003_rgb"]
 
 
 def test_tartanair(world: World, tmp_path: Path):

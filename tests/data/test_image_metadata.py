@@ -89,6 +89,8 @@ def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_
     )
     found = inspect(tmp_path / "a.jpg")
     assert found.crop is None and (found.width, found.height) == (128, 64)
+    PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**whole))
+    assert inspect(tmp_path / "a.jpg").crop is None, "resized, and no part is stated"
 
 
 @pytest.mark.parametrize(

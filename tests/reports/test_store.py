@@ -108,7 +108,7 @@ def test_a_damaged_line_is_named_and_left_out_and_strict_fails(runs, tmp_path):
     edited, old, cut, bare, *others = path.read_text().splitlines()
     edited, old = edited.replace('"ssim"', '"sism"'), old.replace('"schema":', '"schema":90')
     bare = bare[: bare.rindex(',"log"')] + "}"
-    path.write_text("\n".join([edited, old, cut[:500], bare, *others]))
+    path.write_text("\n".join([edited, old, cut[:500], bare, "", *others, ""]))
     done = report("runs", path, "--strict", code=1)
     assert "2 results, 4 left out" in done.output
     for number, reason in enumerate(("was edited", "another version", "is not JSON", "has no log"), start=1):

@@ -3,6 +3,7 @@ from omegaconf import OmegaConf
 from support.composed import composed
 
 from padgs import results
+from padgs.checks import ConfigError
 from padgs.runs.store import RunStore, config_hash, run_id
 
 
@@ -23,9 +24,15 @@ def test_it_reads_like_what_it_is():
 
 @pytest.mark.parametrize("scene", ["客厅", "Квартира 2", "λ", "a" * 200, "客" * 200])
 def test_scenes_in_all_languages_have_readable_names_of_a_length_that_files_may_have(scene):
-    found = name("variant=" + 70 * "x", scene=scene)
-    assert found.startswith(scene[:40].replace(" ", "-"))
-    assert len(found.encode()) < 255 and results.PLAIN.fullmatch(found)
+    for variant in (70 * "x", 70 * "客"):
+        found = name(f"variant={variant}", scene=scene)
+        assert found.startswith(scene[:30].replace(" ", "-"))
+        assert len(found.encode()) < 255 and results.PLAIN.fullmatch(found)
+
+
+def test_a_variant_that_results_could_not_hold_is_refused():
+    with pytest.raises(ConfigError, match="variant has 151 letters; give at most 150"):
+        composed("method=padgs", "variant=" + 151 * "x")
 
 
 @pytest.mark.parametrize(

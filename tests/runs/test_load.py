@@ -143,6 +143,7 @@ def test_an_unfinished_run_is_loaded(folder, tmp_path):
         ),
         ("config.yaml", "data:\n", "date:\n", "is not a configuration of padgs-run"),
         ("config.yaml", "data:\n", "data: [\n", "is not a configuration of padgs-run"),
+        ("config.yaml", "variant: ''", "variant: ${x", "is not a configuration of padgs-run"),
         ("checkpoint/state.json", '"iteration": 30', '"iteration": 29', "was changed after it was written"),
     ],
 )
@@ -197,7 +198,9 @@ def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
     with pytest.raises(RunFolderError, match="has no config.yaml; give the folder of one run"):
         padgs.load_run(tmp_path)
     shutil.copy(folder / "result.json", tmp_path)
-    with pytest.raises(RunFolderError, match="scores of another program's model, which is opened by its own file"):
+    with pytest.raises(
+        RunFolderError, match="has scores and no config.yaml: the same padgs-run restores it; another program"
+    ):
         padgs.load_run(tmp_path)
     shutil.copy(folder / "config.yaml", tmp_path)
     with pytest.raises(RunFolderError, match="has no checkpoint"):

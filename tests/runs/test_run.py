@@ -102,10 +102,12 @@ def test_a_run_that_is_asked_to_stop_and_score_fades_and_ends_well(config, how):
 
 def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):
     first, _ = run(config)
+    (settings := folder_of(config).path / "config.yaml").rename(kept := settings.with_name("kept"))
     monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
     again, said = run(config)
     assert again == first
     assert "finished before" in said and f"{first.scores['paper'].metrics['psnr']:.2f}" in said
+    assert settings.read_bytes() == kept.read_bytes(), "it was lost"
 
 
 def test_a_run_without_test_views_is_finished_all_the_same(config, monkeypatch):

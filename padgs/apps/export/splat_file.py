@@ -120,6 +120,8 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     Scales include the 3D filter of Mip-Splatting files. A DataError says that a file holds no Gaussians, a ValueError
     that the converter is not installed.
     """
+    if not path.exists():
+        raise DataError(f"{path} does not exist; give a file of Gaussians, or the folder of a run")
     if path.name.lower().endswith(CONVERTED):
         check_suffix(path, "reading")
         with tempfile.TemporaryDirectory() as folder:
@@ -136,7 +138,8 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     if "packed_position" in names:
         raise DataError(f"{path} is a compressed PLY; name it {path.stem}.compressed.ply")
     if missing := [name for name in (*_NEEDED, *(f"f_rest_{n}" for n in range(rest))) if name not in names]:
-        raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
+        rule = f"Gaussians of 3DGS have {', '.join(_NEEDED)}; a point cloud belongs in data.points"
+        raise DataError(f"{path} has no property {missing[0]}; {rule}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
         raise DataError(f"{path} has {rest} properties f_rest_*; degrees 0 to 3 have 0, 9, 24 or 45: export one")

@@ -14,7 +14,7 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("roam360", ("pose_c2w.json",)),
     ("ricoh360", ("output_dir/colmap/images.txt",)),
     ("released", ("data_extrinsics.json", "data_views.json")),
-    ("ob3d", ("cameras/*_cam.json",)),
+    ("ob3d", ("cameras/[!.]*_cam.json",)),
     ("tartanair", ("poses.txt", "scene.json")),
     ("colmap", ()),
     ("omniblender", ("transform.json",)),

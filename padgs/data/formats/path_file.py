@@ -54,20 +54,22 @@ def read_path(
         frames = frames or max(2, round(fps * (len(poses) - 1)))
     if len(poses) < 2:
         raise DataError(f"{file} has {len(poses)} poses; a path needs at least two")
+    if (frames or len(poses)) > MAX_FRAMES:
+        raise DataError(f"{file} gives {frames or len(poses)} frames; a video has at most {MAX_FRAMES}: set --seconds")
     found = torch.stack(poses)
     return found if frames is None else interpolate_poses(found, np.linspace(0, len(poses) - 1, frames))
 
 
 def _keyframe(entry: Json, up: Tensor) -> Tensor:
     if pose := entry.get("cam_from_world"):
-        return torch.linalg.inv(cam_from_pose(pose.numbers(4, 4), pose.where))
+        return torch.linalg.inv(cam_from_pose(pose.numbers(), pose.where))
     position, target = entry["position"].numbers(3), entry["look_at"].numbers(3)
     if not (torch.cat((position, target, up)).abs() <= FARTHEST).all():
         rule = f"not finite, or beyond {FARTHEST:g}"
         raise DataError(f"{entry.where}: position, look_at or up is {rule}; give smaller numbers")
-    if not up.any():
+    if up.norm() < 1e-12:
         raise DataError(f"{entry.where}: up is 0; give a direction")
-    if position.equal(target):
+    if (target - position).norm() <= 1e-12 * position.norm().clamp(min=1e-12):
         raise DataError(f"{entry.where}: position and look_at are both {position.tolist()}; give different ones")
     return look_along(position[None].numpy(), (target - position)[None].numpy(), (up / up.norm()).numpy())[0]
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, Frame, listed
+from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, Frame, first_of
 from padgs.data.cloud import first_ply
 from padgs.data.datasets import DATASETS
 from padgs.data.formats import poses
@@ -47,7 +47,7 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
         for item in data[side].entries():
             name = item["rgb_file"].name()
             matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
-            frames.append(Frame(name, images / name, poses.cam_from_pose(matrix.numbers(4, 4), matrix.where)))
+            frames.append(Frame(name, images / name, poses.cam_from_pose(matrix.numbers(), matrix.where)))
         split[side] = tuple(item["rgb_file"].name() for item in data[side].entries())
     if twice := set(split["train"]) & set(split["test"]):
         raise DataError(f"{file}: {min(twice)} is both a train and a test view; keep it in one list")
@@ -59,13 +59,13 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
 def read_ricoh360(path: Path, options: DataOptions) -> Capture:
     """Read poses and points of a Ricoh360 scene."""
     images = image_folder(path, options.images, ("imgs", "images"))
-    mask, model = path / "imgs" / "mask.png", path / "output_dir" / "colmap"
+    mask, model = first_of(images, ("mask.png",)), path / "output_dir" / "colmap"
     file = model / "images.txt"
     frames = []
     for image in read_images(file):
         name = check_name(image.name, str(file))
         pose = pose_of(image, f"{name} in {file}")
-        frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
+        frames.append(Frame(name, images / name, pose, mask=mask))
     cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
     if cloud is None and (model / "points3D.txt").is_file():
         cloud = read_points(model / "points3D.txt").cloud
@@ -82,7 +82,7 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
     for item in meta["frames"].entries():
         name = item["file_path"].name()
         matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
-        pose = poses.cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
+        pose = poses.cam_from_opengl_pose(matrix.numbers(), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
     names = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")
     return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, names))
@@ -92,7 +92,7 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
     """Read the cameras, depth maps and lists of one trajectory of an OB3D scene."""
     images = image_folder(path, options.images)
     frames: dict[str, Frame] = {}  # by number
-    for file in sorted((path / "cameras").glob("*_cam.json")):
+    for file in sorted((path / "cameras").glob("[!.]*_cam.json")):
         cameras = read_json(file).entries()
         if len(cameras) != 1:
             raise DataError(f"{file} must hold a list of one camera; copy it again")
@@ -106,11 +106,9 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
         raise DataError(f"{path / 'cameras'} holds no NNNNN_cam.json; give the folder Egocentric or Non-Egocentric")
     split = {}
     for side, name in LISTS.items():
-        if (path / name).is_file():
-            numbers = [line.removesuffix("_rgb.png").zfill(5) for line in read_list(path / name)]
-            if absent := [number for number in numbers if number not in frames]:
-                raise DataError(f"{path / name} names {listed(absent)}, which have no camera; copy the data set again")
-            split[side] = tuple(frames[number].name for number in numbers)
+        if listing := first_of(path, (name,)):
+            lines = read_list(listing)
+            split[side] = tuple(f"{line.zfill(5)}_rgb.png" if line.isdecimal() else line for line in lines)
     depth, cloud = DepthMeaning("ray", 1.0, "OB3D"), first_ply(path, ("sparse/sparse.ply",))
     name = "_".join(path.absolute().parts[-2:])
     return Capture("ob3d", path, images, tuple(frames.values()), cloud, split or None, depth=depth, name=name)
@@ -121,7 +119,7 @@ def read_tartanair(path: Path, options: DataOptions) -> Capture:
     images, file = image_folder(path, options.images), file_in(path, "poses.txt")
     frames = []
     for index, line in enumerate(read_lines(file), start=1):
-        if not line.strip():
+        if not line.strip() or line.startswith("#"):
             continue
         where = f"line {index} of {file}"
         try:

@@ -79,11 +79,11 @@ def read_openmvg(path: Path, options: DataOptions) -> Capture:
 
 
 def read_released(path: Path, options: DataOptions) -> Capture:
-    """Read a folder of the released PaD-GS or ODGS code. Views and extrinsics are joined by key."""
+    """Read a folder of the released PaD-GS or ODGS code. Views and extrinsics are joined by the key of the pose."""
     views = _mvg_views(read_json(file_in(path, "data_views.json")))
     poses = _mvg_poses(read_json(file_in(path, "data_extrinsics.json")))
     images = image_folder(path, options.images)
-    frames = tuple(Frame(view.name, images / view.name, poses[view.key]) for view in views if view.key in poses)
+    frames = tuple(Frame(view.name, images / view.name, poses[view.pose]) for view in views if view.pose in poses)
     return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply")))
 
 

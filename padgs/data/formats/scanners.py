@@ -32,23 +32,25 @@ def read_navvis(path: Path, options: DataOptions) -> Capture:
     lines = [(number, line) for number, line in enumerate(read_lines(file), 1) if line.strip()]
     if not lines:
         raise DataError(f"{file} holds no header; it must begin with '# pano poses v1.0: ID; filename; timestamp; ...'")
-    head = lines[0][1].rpartition(":")[2].lstrip("# ")
-    mark = ";" if ";" in head else ","
-    names = [name.strip() for name in head.split(mark)]
+    first = next((n for n, (_, line) in enumerate(lines) if "filename" in line.casefold()), 0)
+    head = lines[first][1].rpartition(":")[2].lstrip("# ")
+    mark = next(sign for sign in ";\t," if sign in head or sign == ",")
+    stated = [name.strip() for name in head.split(mark)]
+    names = [name.casefold() for name in stated]
     if absent := [name for name in ("filename", *COLUMNS) if name not in names]:
-        raise DataError(f"{file}, line {lines[0][0]} lacks the columns {listed(absent, 8)}; export the poses again")
+        raise DataError(f"{file}, line {lines[first][0]} lacks the columns {listed(absent, 8)}; export the poses again")
     folder = file.absolute().parent
     folder = folder.parent if folder.name == "pano" else folder
     images = image_folder(folder, options.images) if options.images else image_folder(file.parent, None)
     frames = []
-    for number, line in lines[1:]:
+    for number, line in (row for row in lines[first + 1 :] if not row[1].startswith("#")):
         row = next(csv.reader([line], delimiter=mark, skipinitialspace=True))
         where = f"{file}, line {number}"
         try:
             fields = dict(zip(names, map(str.strip, row), strict=True))
             values = torch.tensor([float(fields[name]) for name in COLUMNS], dtype=torch.float64)
         except ValueError as error:
-            what = f"{line.strip()[:60]!r} is not {'; '.join(names)} ({error})"
+            what = f"{line.strip()[:60]!r} is not {'; '.join(stated)} ({error})"
             raise DataError(f"{where}: {what}; export the poses again, with decimal points") from error
         name = check_name(fields["filename"], where)
         frames.append(Frame(name, images / name, cam_from_panorama(values[3:], values[:3], where)))

@@ -1,6 +1,7 @@
 """Writers of all formats: the files beside the images."""
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,4 +173,6 @@ def _write_json(path: Path, value: Any) -> None:
 def _write_lists(content: Content, folder: Path, extensions: bool = True) -> None:
     for side, names in content.split.items():
         lines = [name if extensions else view_name(name) for name in names]
+        if broken := next((name for name in names if re.search(r"[\r\n]", name)), None):
+            raise DataError(f"{broken!r} has a line break, and a list has one name a line; rename the image")
         (folder / LISTS[side]).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

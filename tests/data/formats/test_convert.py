@@ -15,7 +15,7 @@ from support.fixtures import WRITERS, World, write_cloud, write_colmap_text
 
 from padgs.cli.convert import FORMATS
 from padgs.data import DataError, DataOptions, load, read
-from padgs.data.capture import Frame
+from padgs.data.capture import Frame, view_name
 from padgs.data.formats import writers
 from padgs.data.formats.convert import convert
 from padgs.scene import Scene
@@ -169,12 +169,37 @@ def test_a_full_disk_leaves_no_files(world: World, tmp_path: Path, monkeypatch: 
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
-def test_convert_refuses_invalid_calls(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", [" lead.png", "trail .png", "\u3000x.png"])
+@pytest.mark.parametrize("to", ["openmvg", "released", "opensfm", "colmap", "transforms"])
+def test_names_with_outer_spaces(name: str, to: str, world: World, tmp_path: Path) -> None:
+    WRITERS["transforms"](world, tmp_path / "in")
+    text = (tmp_path / "in" / "transforms.json").read_text()
+    (tmp_path / "in" / "images" / "pano_01.png").rename(tmp_path / "in" / "images" / name)
+    (tmp_path / "in" / "transforms.json").write_text(text.replace("pano_01.png", name))
+    for file in (tmp_path / "in").glob("*.txt"):
+        file.write_text(file.read_text().replace("pano_01", view_name(name)))
+    convert(tmp_path / "in", tmp_path / "out", to)
+    split = [[view.name for view in side] for side in (load(tmp_path / "out").train, load(tmp_path / "out").test)]
+    assert split == [[view.name for view in side] for side in (load(tmp_path / "in").train, load(tmp_path / "in").test)]
+    (tmp_path / "in" / "images" / name).rename(tmp_path / "in" / "images" / "x\ny.png")
+    (tmp_path / "in" / "transforms.json").write_text(text.replace("pano_01.png", "x\\ny.png"))
+    for file in (tmp_path / "in").glob("*.txt"):
+        file.unlink()
+    if to != "transforms":
+        with pytest.raises(DataError, match="has a line break, and a list has one name a line; rename the image"):
+            convert(tmp_path / "in", tmp_path / "out 2", to, options=DataOptions(test_every=2))
+
+
+def test_convert_refuses_invalid_calls(world: World, tmp_path: Path, monkeypatch) -> None:
     WRITERS["omniblender"](world, tmp_path / "in")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     with pytest.raises(DataError, match="full exists; nothing is overwritten"):
         convert(tmp_path / "in", tmp_path / "full", "colmap")
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    with pytest.raises(ValueError, match=r"\. is the working folder or a root, which is not replaced; name a new one"):
+        convert(tmp_path / "in", Path(), "colmap")
     with pytest.raises(ValueError, match="unknown format 'ply'; known: colmap, transforms"):
         convert(tmp_path / "in", tmp_path / "out", "ply")
     with pytest.raises(DataError, match="there is no point cloud, and a COLMAP model needs one"):

@@ -95,6 +95,33 @@ def test_ricoh360_reads_its_mask(world: World, tmp_path: Path) -> None:
     scene = load(tmp_path / "bricks")
     assert "mask" not in [view.name for view in (*scene.train, *scene.test)]
     assert scene.train[0].mask().eq(1).all()  # type: ignore[union-attr]
+    (tmp_path / "bricks" / "imgs").rename(tmp_path / "bricks" / "images")
+    (tmp_path / "bricks" / "images" / "mask.png").rename(tmp_path / "bricks" / "images" / "Mask.PNG")
+    assert load(tmp_path / "bricks").train[0].mask() is not None
+
+
+def test_extrinsics_are_of_poses(world: World, tmp_path: Path) -> None:
+    WRITERS["released"](world, tmp_path / "a")
+    before = load(tmp_path / "a").fingerprint
+    views, poses = (json.loads((tmp_path / "a" / f"data_{name}.json").read_text()) for name in ("views", "extrinsics"))
+    for view in views["views"]:
+        view["value"]["ptr_wrapper"]["data"]["id_pose"] += 100
+    for pose in poses["extrinsics"]:
+        pose["key"] += 100
+    (tmp_path / "a" / "data_views.json").write_text(json.dumps(views))
+    (tmp_path / "a" / "data_extrinsics.json").write_text(json.dumps(poses))
+    assert load(tmp_path / "a").fingerprint == before
+
+
+def test_names_that_share_a_file_of_results_are_refused(world: World, tmp_path: Path) -> None:
+    whole = _written(world, tmp_path)
+    for frame, name in zip(whole["frames"], ("images/a/b.png", "images/a-b.png"), strict=False):
+        (tmp_path / "scene" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "scene" / frame["file_path"]).rename(tmp_path / "scene" / name)
+        frame["file_path"] = name
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps(whole))
+    with pytest.raises(DataError, match="'a/b.png' and 'a-b.png' would share one name"):
+        load(tmp_path / "scene", split="every")
 
 
 def test_pairs_of_transforms_files(world: World, tmp_path: Path) -> None:

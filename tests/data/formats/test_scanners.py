@@ -6,6 +6,7 @@ import os
 import re
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -100,6 +101,22 @@ def test_other_points_do_not_turn_the_cameras(points: str, world: World, tmp_pat
         file.unlink()
     notes = load(tmp_path / "scan", points=points.replace("grey", "x/grey")).notes
     assert any("centres of images along x of their poses: not tested by colours" in note for note in notes)
+
+
+@pytest.mark.parametrize("mark", ["; ", "\t", ", "])
+def test_comments_marks_and_case_of_navvis(mark: str, world: World, tmp_path: Path) -> None:
+    write_navvis(world, tmp_path)
+    before, file = load(tmp_path), tmp_path / "pano" / "pano-poses.csv"
+    head, *rows = file.read_text().replace("; ", mark).splitlines()
+    lines = ["# made by a scanner", head.replace("pano_pos", "Pano_Pos"), "# rows", *rows]
+    file.write_text("\n".join(lines))
+    assert torch.equal(load(tmp_path).train[0].cam_from_world, before.train[0].cam_from_world)
+
+
+def test_colours_that_agree_with_no_reading_are_named(world: World, tmp_path: Path) -> None:
+    write_navvis(replace(world, centers=1000 * world.centers + 3), tmp_path)
+    notes = load(tmp_path).notes
+    assert any("colours agree by" in note and "the poses may be wrong: run padgs check" in note for note in notes)
 
 
 @pytest.mark.parametrize(
