@@ -245,11 +245,6 @@ def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:
     return found
 
 
-def _minimal_count(found: Mapping[str, Any]) -> float | None:
-    """Return the Gaussians of the smallest model for a loss of `SMALLEST_STATED` dB, if it was searched."""
-    return found["steps"][found["minimal"][f"{SMALLEST_STATED:g}"]]["blended"] if "steps" in found else None
-
-
 def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
     """Return file name of a render -> PSNR (or else WS-PSNR) of the view, by the first protocol that has it."""
     found: dict[str, float] = {}
@@ -295,7 +290,11 @@ NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "anchors": lambda result: result.counts.get("anchors"),
     "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before training
     "gaussians": lambda result: result.counts.get("gaussians"),
-    "minimal_count": lambda result: _minimal_count(result.smallest),
+    "minimal_count": lambda result: (  # Gaussians of the smallest model for a loss of `SMALLEST_STATED` dB
+        found["steps"][found["minimal"][f"{SMALLEST_STATED:g}"]]["blended"]
+        if "steps" in (found := result.smallest)
+        else None
+    ),
     "megabytes": lambda result: result.model_bytes / 1e6 or None,
     "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the processes that trained
     "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there

@@ -6,7 +6,7 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from statistics import median
@@ -191,18 +191,15 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         such = f"named like an image (such as {capture.frames[0].name}.png)"
         raise DataError(f"{given} holds no mask {such}; rename them, or set data.mask=none")
     turned = " (white is ignored)" if any(path.name.startswith(INVERTED) for path in found.values()) else ""
-    unused = [] if len(found) == len(capture.frames) else _images_without(found.values(), given)
+    unused: list[str] = []
+    if len(found) < len(capture.frames):
+        others = sorted({*given.glob("*")} - {*found.values()})
+        unused = [path.name for path in others if path.suffix.lower() in EXTENSIONS]
     if given.parent == capture.folder:
         there = (first_of(capture.folder, (name,), Path.is_dir) for name in MASK_FOLDERS)
         unused += [f"{folder.name}/" for folder in there if folder not in (given, None)]
     rest = f"; not used: {listed(unused)}" if unused and not beside else ""
     return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views{turned}{rest}"
-
-
-def _images_without(used: Iterable[Path], folder: Path) -> list[str]:
-    """Return the names of the images in a folder that are not used."""
-    files = (file for file in sorted(folder.glob("*")) if file.suffix.lower() in EXTENSIONS)
-    return [file.name for file in files if file not in set(used)]
 
 
 def masks_beside(name: str) -> list[str]:
