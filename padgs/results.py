@@ -251,8 +251,8 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
         result = replace(typed(Result, document), scores=scores)
         _refuse_impossible(result)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        why = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise ResultError(f"{where}: {why:.300}; delete it and run again") from error
+        lacks = "lacks " * isinstance(error, KeyError)
+        raise ResultError(f"{where}: {lacks}{str(error):.300}; delete it and run again") from error
     if edited:
         raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
     names = [result.run, result.method, result.preset, *result.experiments, *result.scores]

@@ -5,6 +5,7 @@ Transforms are named a_from_b: `cam_from_world` maps world points to the camera 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -99,6 +100,8 @@ class Scene:
         distance = middle.norm() / self.scale
         if not distance > FAR:
             return replace(self, points=self.points.float())
+        step = 2.0 ** round(math.log2(self.scale) - 10)  # processors differ in the last bits, and agree in these steps
+        middle = (middle / step).round() * step
         train, test = (
             tuple(replace(view, cam_from_world=move_origin(view.cam_from_world, middle)) for view in views)
             for views in (self.train, self.test)

@@ -134,8 +134,9 @@ class ExternalRun(LoadedRun):
         finite = torch.stack([values.isfinite().reshape(len(splats), -1).all(1) for values in rows.values()])
         in_range = splats.log_scales.exp().isfinite().all(1) & (splats.means.abs() <= FARTHEST).all(1)
         if not (kept := finite.all(0) & in_range).all():
-            what = f"values that are not finite, or beyond {FARTHEST:g}"
-            notes.append(f"{int((~kept).sum())} Gaussians have {what}, and are left out")
+            notes.append(
+                f"{int((~kept).sum())} Gaussians have values that are not finite or too large; they are left out"
+            )
             splats.load({name: values[kept] for name, values in rows.items()})
         if not len(splats):
             raise DataError(f"{file} has no Gaussians with finite values; export it again")

@@ -26,6 +26,7 @@ from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
 MAX_GAP = 1e4  # between cameras and points, times the median distances within both
+POSE_BITS = 20  # of numbers of poses in the fingerprint
 MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 HIDDEN = (".", "__MACOSX", "@eaDir", "@Recycle", "#recycle")  # beginnings of names; network drives keep previews there
@@ -105,9 +106,9 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):
         digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
-        digest.update(view.cam_from_world.numpy().tobytes())
         if view.lens is not None:
             digest.update(view.lens.rays().numpy().tobytes())
+    digest.update(_rounded(torch.stack([view.cam_from_world for view in views])).numpy().tobytes())
     digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
     if any(view.share != 1 for view in views):
         digest.update(f"shares{[view.share for view in views]}".encode())
@@ -116,6 +117,12 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     digest.update(scene.points.numpy().tobytes())
     digest.update(colors.numpy().tobytes())
     return replace(scene, fingerprint=digest.hexdigest())
+
+
+def _rounded(poses: Tensor) -> Tensor:
+    """Return poses [F, 4, 4] as integers, without the last bits, in which processors differ; lengths by the largest."""
+    lengths = poses[:, :3, 3].abs().max().clamp(min=1e-300)
+    return torch.cat((poses[:, :3, :3], poses[:, :3, 3:] / lengths), -1).mul(2.0**POSE_BITS).round().long()
 
 
 def _refuse_other_world(capture: Capture, points: Tensor) -> None:

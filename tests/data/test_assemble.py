@@ -12,11 +12,13 @@ import pytest
 import torch
 from PIL import Image
 from support.fixtures import World, write_colmap_text, write_transforms
+from torch import Tensor
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
 from padgs.data.assemble import disk_cache
 from padgs.data.capture import Cloud
 from padgs.data.cloud import write_ply
+from padgs.data.formats import poses
 
 
 @pytest.fixture
@@ -294,6 +296,26 @@ def test_images_that_the_disk_cache_holds_do_not_count_against_it(tmp_path, monk
     (tmp_path / "cache" / "a").write_bytes(bytes(400))
     free = 600
     assert disk_cache(options, 400)[0] == tmp_path / "cache"
+
+
+@pytest.mark.parametrize("place", [0.0, 5e6])
+def test_fingerprints_do_not_depend_on_the_last_bits_of_poses(
+    place: float, world: World, tmp_path, monkeypatch
+) -> None:
+    """Processors of other types compute other last bits, and a run goes on on another one of a cluster."""
+    write_colmap_text(replace(world, centers=world.centers + place, points=world.points + place), tmp_path)
+    before, exact = load(tmp_path), poses.checked_rotation
+    noise = torch.Generator().manual_seed(0)
+
+    def rounded_otherwise(rotation: Tensor, where: str) -> Tensor:
+        return exact(rotation, where) + 2e-16 * torch.randn(3, 3, generator=noise, dtype=torch.float64)
+
+    monkeypatch.setattr(poses, "checked_rotation", rounded_otherwise)
+    after = load(tmp_path)
+    assert after.fingerprint == before.fingerprint and torch.equal(after.points, before.points)
+    assert not torch.equal(after.train[0].cam_from_world, before.train[0].cam_from_world)
+    monkeypatch.setattr(poses, "checked_rotation", lambda rotation, where: exact(rotation, where) + 1e-5)
+    assert load(tmp_path).fingerprint != before.fingerprint
 
 
 def test_points_of_another_world_are_refused(world: World, tmp_path: Path) -> None:

@@ -66,11 +66,6 @@ def detect(path: Path) -> tuple[str, str]:
     return name, reason
 
 
-def _first_match(folder: Path, pattern: str) -> Path | None:
-    """Return the first file of a pattern in a folder; names without * and folders are in any case, as for readers."""
-    return first_of(folder, (pattern,)) or next(iter(sorted(folder.glob(pattern))), None)
-
-
 def _found(path: Path) -> dict[str, str]:
     """Return the formats that a folder or file may have, and what identifies each."""
     found: dict[str, str] = {}
@@ -82,6 +77,6 @@ def _found(path: Path) -> dict[str, str]:
         elif format == "metashape":
             if path.is_dir() and (xml := find_xml(path)):
                 found[format] = xml.name
-        elif files and all(there := [_first_match(path, file) for file in files]):
+        elif files and all(there := [first_of(path, (f,)) or next(iter(sorted(path.glob(f))), None) for f in files]):
             found.setdefault(format, " and ".join(file.relative_to(path).as_posix() for file in there if file))
     return found

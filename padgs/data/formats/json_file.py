@@ -88,9 +88,8 @@ class Json:
     def _of(self, kind: type | tuple[type, ...], words: str) -> Any:
         """Return the value if it has this type, else refuse it."""
         if not isinstance(self.value, kind):
-            shown = "" if isinstance(self.value, (Mapping, list)) else f" {self.value!r}"
-            kind_of = f"{type(self.value).__name__}{shown}"
-            raise DataError(f"{self.where} must be {words}, not {kind_of}; correct it, or export the file again")
+            found = type(self.value).__name__ if isinstance(self.value, (Mapping, list)) else repr(self.value)
+            raise DataError(f"{self.where} must be {words}, not {found:.60}; correct it, or export the file again")
         return self.value
 
 

@@ -37,11 +37,6 @@ FEW_VIEWS = 8  # training views that leave surfaces open
 AMPLE_PIXELS = 16  # training pixels per Gaussian that make dropout unnecessary
 
 
-def iterations_per_round(iterations: int) -> int:
-    """Return the interval between densification rounds in a run of `iterations`."""
-    return max(1, round(DENSIFIED_SHARE * iterations / ROUNDS))
-
-
 @dataclass(frozen=True)
 class PlusOptions(SplatOptions):
     """The `method` group of the configuration. Shares of the run are in [0, 1], so no schedule has a length."""
@@ -115,7 +110,7 @@ class PlusOptions(SplatOptions):
 
     def for_run(self, iterations: int) -> DensificationOptions:
         """Return options with evenly spaced rounds up to `DENSIFIED_SHARE` of the run and no opacity resets."""
-        every = iterations_per_round(iterations)
+        every = max(1, round(DENSIFIED_SHARE * iterations / ROUNDS))
         names = (field.name for field in fields(DensificationOptions))
         plain = DensificationOptions(**{name: getattr(self, name) for name in names})
         # Higher in short runs, because new Gaussians take iterations to fit.

@@ -18,7 +18,6 @@ from padgs.methods.plus.method import (
     ROUNDS,
     PlusMethod,
     PlusOptions,
-    iterations_per_round,
 )
 from padgs.methods.plus.smoothness import roughness
 from padgs.methods.splats.depth_initialization import MIN_PIXELS, solid_angle_pixels
@@ -79,7 +78,7 @@ def test_the_most_important_gaussians_are_kept():
     trained, tiny = [], tiny_scene()
     for psnr in (None, 44.0):
         method = PlusMethod(replace(OPTIONS, prune_psnr=psnr, dropout=0.0))
-        for record in islice(method.fit(tiny, Budget(200)), 9 * iterations_per_round(200)):
+        for record in islice(method.fit(tiny, Budget(200)), 9 * PlusOptions().for_run(200).densify_every):
             before = record.counts["gaussians"]
         trained.append(method.model)
         assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
