@@ -191,14 +191,12 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         such = f"named like an image (such as {capture.frames[0].name}.png)"
         raise DataError(f"{given} holds no mask {such}; rename them, or set data.mask=none")
     turned = " (white is ignored)" if any(path.name.startswith(INVERTED) for path in found.values()) else ""
-    unused: list[str] = []
-    if len(found) < len(capture.frames):
-        others = sorted({*given.glob("*")} - {*found.values()})
-        unused = [path.name for path in others if path.suffix.lower() in EXTENSIONS]
+    others = sorted({*given.glob("*")} - {*found.values()}) if len(found) < len(capture.frames) else []
+    left = [path.name for path in others if path.suffix.lower() in EXTENSIONS]
     if given.parent == capture.folder:
         there = (first_of(capture.folder, (name,), Path.is_dir) for name in MASK_FOLDERS)
-        unused += [f"{folder.name}/" for folder in there if folder not in (given, None)]
-    rest = f"; not used: {listed(unused)}" if unused and not beside else ""
+        left += [f"{folder.name}/" for folder in there if folder not in (given, None)]
+    rest = f"; not used: {listed(left)}" if left and not beside else ""
     return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views{turned}{rest}"
 
 

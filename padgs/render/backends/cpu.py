@@ -140,7 +140,8 @@ class _Image(native.NativeImage):
             owner = torch.repeat_interleave(torch.arange(count), strip.slot_start.diff())
             sums.index_add_(0, owner, found[:, :-1].double())
             peak.scatter_reduce_(0, owner, found[:, -1], "amax")
-        return Removals(*sums.unbind(-1), peak)
+        error, change, contribution = sums.unbind(-1)
+        return Removals(error, change, contribution, peak)
 
     def project_backward(
         self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool

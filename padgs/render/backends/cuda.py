@@ -200,7 +200,8 @@ class _Image(NativeImage):
             of_slots = functools.partial(torch.segment_reduce, offsets=starts, axis=0, initial=0, unsafe=True)
             sums[drawn] += of_slots(found[:, :-1].double(), "sum")
             peak[drawn] = torch.maximum(peak[drawn], of_slots(found[:, -1].contiguous(), "max"))
-        return Removals(*sums.unbind(-1), peak)
+        error, change, contribution = sums.unbind(-1)
+        return Removals(error, change, contribution, peak)
 
     def project_backward(
         self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
