@@ -18,7 +18,7 @@ from pandas import DataFrame
 
 from padgs.checks import printable
 from padgs.reports.methods import EXTERNAL
-from padgs.reports.published import Place
+from padgs.reports.published import SAME_DATA, Place
 from padgs.reports.store import Run
 from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, flat, picture_name
 
@@ -269,7 +269,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "experiments": lambda result: result.experiments or (AD_HOC,),
     "place": lambda result: Place.of(result.dataset, result.scene, result.fingerprint),
     "resolution": lambda result: f"{result.width}x{result.height}",
-    "data": lambda result: result.fingerprint[:10],
+    "data": lambda result: SAME_DATA.get(result.fingerprint[:10], result.fingerprint[:10]),
     "cameras": lambda result: _kinds(result.cameras),
     "length": lambda result: None if result.external else _length(result),
     "learning_rates": _learning_rates,

@@ -18,11 +18,10 @@ SCENES = {"center_1": "center1"}  # names in the file -> names of the folders, w
 AVERAGE = "average"
 BUILT_IN = "synthetic"  # data set of the generated scenes; their names begin with it
 NOT_TUNED_ON, TUNED_ON = "not tuned on", "tuned on"
+_KNOWN = yaml.safe_load((FILE.parent.parent / "conf" / "tuned_on.yaml").read_text("utf-8"))
+SAME_DATA = {other: first for first, others in _KNOWN.pop("same").items() for other in others}  # of fingerprints
 SEEN = {  # beginning of the fingerprint of a capture, or name of a generated scene -> NOT_TUNED_ON or TUNED_ON
-    data: kind.replace("_", " ")
-    for kind, scenes in yaml.safe_load((FILE.parent.parent / "conf" / "tuned_on.yaml").read_text("utf-8")).items()
-    for known in scenes.values()
-    for data in known
+    data: kind.replace("_", " ") for kind, scenes in _KNOWN.items() for known in scenes.values() for data in known
 }
 OUTDOOR = {"outdoor", "garden", "plaza", "courtyard", "park", "street"}  # words of names; all others are for Table 1
 
@@ -62,7 +61,8 @@ class Place:
         >>> Place.of("", "room", "e7acbfd00cf5").seen, Place.of("", "room", "0123456789").seen  # a room of someone else
         ('tuned on', '')
         """
-        return cls(dataset, scene, seen=SEEN.get(scene if dataset == BUILT_IN else fingerprint[:10], ""))
+        data = SAME_DATA.get(fingerprint[:10], fingerprint[:10])
+        return cls(dataset, scene, seen=SEEN.get(scene if dataset == BUILT_IN else data, ""))
 
     @property
     def published(self) -> bool:

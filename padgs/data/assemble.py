@@ -26,7 +26,6 @@ from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
 MAX_GAP = 1e4  # between cameras and points, times the median distances within both
-POSE_BITS = 20  # of numbers of poses in the fingerprint
 MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 HIDDEN = (".", "__MACOSX", "@eaDir", "@Recycle", "#recycle")  # beginnings of names; network drives keep previews there
@@ -120,9 +119,9 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
 
 
 def _rounded(poses: Tensor) -> Tensor:
-    """Return poses [F, 4, 4] as integers, without the last bits, in which processors differ; lengths by the largest."""
+    """Return poses [F, 4, 4] in millionths, without the bits in which processors differ; lengths by the largest."""
     lengths = poses[:, :3, 3].abs().max().clamp(min=1e-300)
-    return torch.cat((poses[:, :3, :3], poses[:, :3, 3:] / lengths), -1).mul(2.0**POSE_BITS).round().long()
+    return torch.cat((poses[:, :3, :3], poses[:, :3, 3:] / lengths), -1).mul(2.0**20).round().long()
 
 
 def _refuse_other_world(capture: Capture, points: Tensor) -> None:

@@ -2,9 +2,10 @@ import csv
 
 import pytest
 
+import padgs.data
 from padgs.data.datasets import DATASETS
 from padgs.reports import published
-from padgs.reports.published import Key, load
+from padgs.reports.published import SAME_DATA, Key, Place, load
 
 
 def test_a_number_of_each_table():
@@ -13,6 +14,14 @@ def test_a_number_of_each_table():
     assert numbers[Key(2, "ricoh360", "farm", "op43dgs", "psnr")].status == "oom"
     assert numbers[Key(3, "ricoh360", "cat_tower", "padgs/full", "lpips")].value == 0.187
     assert numbers[Key(4, "360roam", "average", "padgs", "fps")].value == 29.87
+
+
+def test_a_capture_is_known_whatever_processor_computed_its_fingerprint(shared):
+    assert (
+        Place.of("", "basement", "4656e179f3ab").seen == Place.of("", "basement", "82d09f11c6ab").seen == "not tuned on"
+    )
+    for scene, first in (("basement", "82d09f11c6"), ("bedroom", "d090e1eaac")):
+        assert SAME_DATA[padgs.data.load(shared / "data" / scene, width=256).fingerprint[:10]] == first
 
 
 def test_every_cell_has_a_number_or_a_reason():

@@ -135,9 +135,8 @@ def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: 
         raise DataError(f"{where} has a {camera.model} camera; {rule}")
     middle = camera.width / 2, camera.height / 2
     if camera.model == "SPHERE" and camera.params[1:] != middle:
-        stated = " ".join(f"{number:g}" for number in camera.params[1:])
-        rule = "a SPHERE must have its middle there, {:g} {:g}: correct the line".format(*middle)
-        raise DataError(f"CX CY of the camera of {where} are {stated}; {rule}")
+        rule = f"a SPHERE must have its middle there, {middle}: correct the line"
+        raise DataError(f"CX CY of the camera of {where} are {camera.params[1:]}; {rule}")
     lens = None if camera.model in model_files.PANORAMIC else partial(lens_of, camera, where)
     return Frame(name, folder / name, pose_of(image, where), camera.width, camera.height, lens=lens)
 
