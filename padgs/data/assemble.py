@@ -48,8 +48,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         unknown(0, 0)
     names = [frame.name for frame in capture.frames]
     if not names:
-        way_out = "export the poses again, or run `padgs prepare IMAGES OUT`"
-        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image; {way_out}")
+        where = f"the {capture.format} model in {capture.folder}"
+        raise DataError(f"{where} holds no posed image; export the poses again, or run `padgs prepare IMAGES OUT`")
     if not panoramas:
         raise DataError(
             f"all {len(frames)} images of {capture.folder} are of other cameras ({frames[0].name}), which can be used "

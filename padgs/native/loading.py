@@ -48,8 +48,7 @@ def find_library(stem: str, requirement: str) -> ctypes.CDLL:
     """Load lib`stem` from this package, or from PADGS_LIBRARY_DIR; OSError if it is missing or does not load."""
     suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
     name = ("" if sys.platform == "win32" else "lib") + stem + suffix
-    spec = importlib.util.find_spec("padgs.native")
-    folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    folders = [Path(folder) for folder in _package_folders()]
     if "PADGS_LIBRARY_DIR" in os.environ:
         folders.insert(0, Path(os.environ["PADGS_LIBRARY_DIR"]))
     for folder in folders:
@@ -67,6 +66,11 @@ def succeeds(load: Callable[[], object]) -> bool:
     except (OSError, RuntimeError):
         return False
     return True
+
+
+def _package_folders() -> list[str]:
+    spec = importlib.util.find_spec("padgs.native")
+    return list(spec.submodule_search_locations or []) if spec else []
 
 
 def declare(

@@ -135,8 +135,7 @@ def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: 
         raise DataError(f"{where} has a {camera.model} camera; {rule}")
     middle = camera.width / 2, camera.height / 2
     if camera.model == "SPHERE" and camera.params[1:] != middle:
-        rule = f"a SPHERE must have its middle there, {middle}: correct the line"
-        raise DataError(f"CX CY of the camera of {where} are {camera.params[1:]}; {rule}")
+        raise DataError(f"{where} has a SPHERE with CX CY {camera.params[1:]}; correct them to its middle, {middle}")
     lens = None if camera.model in model_files.PANORAMIC else partial(lens_of, camera, where)
     return Frame(name, folder / name, pose_of(image, where), camera.width, camera.height, lens=lens)
 

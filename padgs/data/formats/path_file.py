@@ -54,8 +54,8 @@ def read_path(
         frames = frames or max(2, round(fps * (len(poses) - 1)))
     if len(poses) < 2:
         raise DataError(f"{file} has {len(poses)} poses; a path needs at least two")
-    if (frames or len(poses)) > MAX_FRAMES:
-        raise DataError(f"{file} gives {frames or len(poses)} frames; a video has at most {MAX_FRAMES}: set --seconds")
+    if (count := frames or len(poses)) > MAX_FRAMES:
+        raise DataError(f"{file} gives {count} frames; a video has at most {MAX_FRAMES}: set --seconds")
     found = torch.stack(poses)
     return found if frames is None else interpolate_poses(found, np.linspace(0, len(poses) - 1, frames))
 

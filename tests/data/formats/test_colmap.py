@@ -139,7 +139,7 @@ def test_names_of_the_panoramic_camera(camera: str, world: World, tmp_path: Path
     _rewrite(tmp_path, "cameras.txt", lambda text: f"1 {camera}\n")
     assert read(tmp_path).frames[0].width == 64
     _rewrite(tmp_path, "cameras.txt", lambda text: "1 SPHERE 64 32 1 30 16\n")
-    with pytest.raises(DataError, match=r"are \(30.0, 16.0\); a SPHERE must have its middle there, \(32.0, 16.0\)"):
+    with pytest.raises(DataError, match=r"CX CY \(30.0, 16.0\); correct them to its middle, \(32.0, 16.0\)"):
         load(tmp_path)
 
 
