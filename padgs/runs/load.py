@@ -165,7 +165,7 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         if store.path.is_file():
             found = f"{folder} is a file"
         elif (store.path / results.FILE_NAME).is_file() and not settings.is_file():
-            found = f"{folder} has no {settings.name}: the same padgs-run restores it; a model of another program is a file"
+            found = f"{folder} has no {settings.name}: the same padgs-run restores it; a model from elsewhere is a file"
         raise RunFolderError(f"{found}; give the folder of one run, as padgs-run names it at its end")
     try:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))

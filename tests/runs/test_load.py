@@ -199,7 +199,7 @@ def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
         padgs.load_run(tmp_path)
     shutil.copy(folder / "result.json", tmp_path)
     with pytest.raises(
-        RunFolderError, match="has no config.yaml: the same padgs-run restores it; a model of another program"
+        RunFolderError, match="has no config.yaml: the same padgs-run restores it; a model from elsewhere"
     ):
         padgs.load_run(tmp_path)
     shutil.copy(folder / "config.yaml", tmp_path)
