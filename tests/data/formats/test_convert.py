@@ -169,8 +169,13 @@ def test_a_full_disk_leaves_no_files(world: World, tmp_path: Path, monkeypatch: 
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
-@pytest.mark.parametrize("name", [" lead.png", "trail .png", "\u3000x.png"])
-@pytest.mark.parametrize("to", ["openmvg", "released", "opensfm", "colmap", "transforms"])
+@pytest.mark.parametrize(
+    ("name", "to"),
+    [
+        *((name, "released") for name in (" lead.png", "trail .png", "\u3000x.png")),
+        *((" lead.png", to) for to in ("openmvg", "opensfm", "colmap", "transforms")),
+    ],
+)
 def test_names_with_outer_spaces(name: str, to: str, world: World, tmp_path: Path) -> None:
     WRITERS["transforms"](world, tmp_path / "in")
     text = (tmp_path / "in" / "transforms.json").read_text()
