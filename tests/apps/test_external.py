@@ -24,6 +24,7 @@ from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
 from padgs.apps.frame_check import _closest_points, _worlds, as_numbers, check_frame, read_transform
 from padgs.cli.commands import app
+from padgs.data.capture import DataError
 from padgs.data.perturb import StressOptions
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.images import to_uint8
@@ -259,6 +260,11 @@ def test_the_program_is_named_by_the_header(comment, program, tmp_path, generato
     assert program_of(file) == program
 
 
+def test_a_missing_file_of_gaussians_is_named(tmp_path):
+    with pytest.raises(DataError, match="nope.ply does not exist; give a file of Gaussians, or the folder of a run"):
+        open_model(str(tmp_path / "nope.ply"), device="cpu")
+
+
 def test_gaussians_are_shown_without_a_data_set(splats, tmp_path, generator):
     arguments = ("render", splats, "--path", "orbit", "--width", "32", "--seconds", "0.2", "--fps", "10")
     assert padgs_command(*arguments, "--to", tmp_path / "f")[0] == 0 and len([*(tmp_path / "f").iterdir()]) == 2
@@ -267,10 +273,11 @@ def test_gaussians_are_shown_without_a_data_set(splats, tmp_path, generator):
     broken.means.data[0] = float("nan")
     broken.opacity_logits.data[1] = float("inf")  # an opacity of 1 in 8 bits
     broken.log_scales.data[2] = 100.0
+    broken.means.data[3] = 1e30
     write_splats(tmp_path / "a.ply", broken)
     opened = open_model(str(tmp_path / "a.ply"), device="cpu")
-    assert isinstance(opened, ExternalRun) and len(opened.method.model.splats) == len(broken) - 2
-    assert opened.notes == ("2 Gaussians have values that are not finite or too large; they are left out",)
+    assert isinstance(opened, ExternalRun) and len(opened.method.model.splats) == len(broken) - 3
+    assert opened.notes == ("3 Gaussians have values that are not finite or too large; they are left out",)
     shown = padgs_command("render", tmp_path / "a.ply", *arguments[2:], "--to", tmp_path / "g")[1]
     assert opened.notes[0] in shown
 

@@ -114,7 +114,7 @@ def checked_rotation(rotation: Tensor, where: str) -> Tensor:
 
 def _refuse_zeros(rotation: Tensor, where: str) -> Tensor:
     """Return a rotation in any form; a DataError if it is 0, as programs write it for images without a pose."""
-    if rotation.numel() and rotation.abs().max() < 1e-6:
+    if rotation.numel() and rotation.abs().max() < 1e-12:
         raise DataError(f"{where}: the rotation is all zeros, so the image has no pose; {REMEDY}")
     return rotation
 

@@ -31,6 +31,14 @@ def _edit(folder: Path, *changes: tuple[str, str]) -> None:
     (folder / "cameras.xml").write_text(text)
 
 
+def test_a_file_of_another_name_in_utf_16_is_found(folder: Path) -> None:
+    before = load(folder).fingerprint
+    text = re.sub("(?i)utf-8", "utf-16", (folder / "cameras.xml").read_text())
+    (folder / "room.xml").write_text(text, encoding="utf-16")
+    (folder / "cameras.xml").unlink()
+    assert load(folder).fingerprint == before
+
+
 def test_golden_poses_come_back(shared: Path, tmp_path: Path) -> None:
     golden = [np.load(file) for file in sorted((shared / "golden").glob("erp_*.npz"))]
     rotations, shifts = (np.stack([one[key] for one in golden]).astype(float) for key in "Rt")
