@@ -101,11 +101,11 @@ def test_renders_in_a_folder_score_like_their_run(run, tmp_path):
     for view in opened.scene.test:
         Image.fromarray(to_uint8(opened.method.render(view).image)).save(folder / f"{view.name}.png")
     Image.new("RGB", (2, 1)).save(folder / "cover.png")
-    code, output = padgs_command("score", folder, "--data", run, "--to", tmp_path / "my runs", "--label", "x")
-    assert f"next: padgs report runs '{tmp_path / 'my runs'}'" in output
+    code, output = padgs_command("score", folder, "--data", run, "--to", tmp_path / "a b", "--label", "x")
+    assert f"next: padgs report runs '{tmp_path / 'a b'}'" in output
     assert code == 0 and "1 files belong to no test view, such as cover.png" in output, output
     own = results.read(run / results.FILE_NAME).scores["sphere"].metrics
-    assert the_result(tmp_path / "my runs").scores["sphere"].metrics["ws_psnr"] == pytest.approx(own["ws_psnr"], abs=1e-4)
+    assert the_result(tmp_path / "a b").scores["sphere"].metrics["ws_psnr"] == pytest.approx(own["ws_psnr"], abs=1e-4)
     whole = (folder / f"{view.name}.png").read_bytes()
     (folder / f"{view.name}.png").write_bytes(whole[: len(whole) // 2])
     code, output = padgs_command("score", folder, "--data", run, "--to", tmp_path / "damaged")
