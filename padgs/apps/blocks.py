@@ -170,8 +170,8 @@ def _owners(train: Sequence[View], seen: np.ndarray, points: Tensor, clusters: S
     return weight.argmax(0)
 
 
-def split(source: Path, destination: Path, count: int, format: str, options: DataOptions) -> list[str]:
-    """Write a data set for each block into a new folder; images are links. Return a line about each block.
+def split(source: Path, destination: Path, count: int, format: str, options: DataOptions) -> dict[Path, str]:
+    """Write a data set for each block into a new folder; images are links. Return folder -> content of each block.
 
     Nothing is written if a DataError says that the source cannot be divided, or that the destination exists.
     """
@@ -188,10 +188,11 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
     frames = {view_name(frame.name): frame for frame in capture.frames}
     masks = {view.name: view.load_mask for view in (*scene.train, *scene.test)}
     given = {key: value for key, value in asdict(options).items() if key in ("images", "mask", "split", "dataset")}
+    given["cameras"] = "panoramas"  # of the merged run too
     for key in ("images", "mask"):  # `padgs merge` may run elsewhere
         if given[key] and os.path.exists(given[key]) and not (source / given[key]).exists():
             given[key] = os.path.abspath(given[key])
-    lines = []
+    written = {}
     destination.parent.mkdir(parents=True, exist_ok=True)
     with draft_of(destination) as partial:
         partial.mkdir()
@@ -233,9 +234,9 @@ def split(source: Path, destination: Path, count: int, format: str, options: Dat
             block["source"] = os.path.relpath(source.resolve(), final.resolve())
             (folder / BLOCK).write_text(json.dumps(block, indent=1))
             parts = f"{len(core)} training views, {len(margin)} in the margin, {len(blocks.test[number])} test views"
-            lines.append(f"{final}: {parts}, {int(kept.sum())} points")
+            written[final] = f"{parts}, {int(kept.sum())} points"
         os.replace(partial, destination)
-    return lines
+    return written
 
 
 def partial_mask(view: View, held: np.ndarray) -> Callable[[], Tensor]:
@@ -314,7 +315,8 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
         )
         result = store.finish(scored(config, scene, store, result, method) if scene.test else result)
     show_result(result, store.path, console)
-    refine = ["padgs-run", f"data.path={config.data.path}", f"init={store.path}", "train.refine=true"]
+    whole = (f"data.path={config.data.path}", "data.cameras=panoramas")
+    refine = ["padgs-run", *whole, f"init={store.path}", "train.refine=true"]
     say(console, f"to join the blocks, with their other settings: {shlex.join(refine)}", "dim")
     return store.path
 

@@ -126,9 +126,9 @@ def write_video(
             rendering = render(view)
             writers[0](to_uint8(rendering.image))
             if depth:
-                steps = rendering.depth if npy or is_mp4 else (rendering.depth / unit).round().clamp(0, 2**16 - 1)
-                numbers = steps.cpu().numpy().astype(np.float32 if npy else np.uint16)
-                writers[1](depth_image(rendering, scene_scale) if is_mp4 else numbers)
+                steps = rendering.depth if npy else (rendering.depth / unit).round().clamp(0, 2**16 - 1)
+                kind = np.float32 if npy else np.uint16
+                writers[1](depth_image(rendering, scene_scale) if is_mp4 else steps.cpu().numpy().astype(kind))
             progress(number + 1)
     if depth and not is_mp4:
         statement = {"measure": "ray", "unit": unit, "frames": _frames(views, origin)}

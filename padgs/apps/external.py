@@ -107,7 +107,6 @@ def config_of(data: str, render: RenderConfig | None = None, device: str = "auto
 class ExternalRun(LoadedRun):
     """Gaussians of another program, opened like a run."""
 
-    notes: tuple[str, ...] = ()
     program: tuple[str, str] = ("", "")  # name and version
     given: Similarity = field(default_factory=Similarity)  # data_from_file, as the user stated it
     world: Similarity = field(default_factory=Similarity)  # scene_from_data: a shift of files in map coordinates
@@ -161,7 +160,7 @@ class ExternalRun(LoadedRun):
         folder = file.with_name(re.sub(r"(\.compressed)?\.\w+$", "", file.name))
         method = ExternalMethod.of(splats, render)
         result = initial_result(config, scene, folder.name)
-        run = cls(folder, config, method, result, 0, "", tuple(notes), program, given, world, file)
+        run = cls(folder, config, method, result, 0, "", program, given, world, file, notes=tuple(notes))
         run.scene = scene
         return run
 
@@ -205,13 +204,19 @@ def open_model(
 
 
 def scene_without_photographs(splats: Splats, file: Path) -> Scene:
-    """Return a scene whose points are the opaque Gaussians, with one view amid them; -y is up, as in most files."""
+    """Return a scene whose points are the opaque Gaussians, with one view amid them; -y is up, as in most files.
+
+    Where half of them are in one place, as a single one is, the view is before it.
+    """
     opaque = torch.sigmoid(splats.opacity_logits) >= OPAQUE
     opaque = opaque if opaque.any() else torch.ones_like(opaque)
     points = splats.means[opaque].detach()
     colors = (255 * (0.5 + harmonics.DC * splats.sh_dc[opaque]).clamp(0, 1)).round().to(torch.uint8)
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = -points.double().median(0).values
+    middle = points.double().median(0).values
+    if (points - middle).norm(dim=1).median() == 0:
+        middle[2] -= 10 * splats.log_scales[opaque].exp().max()
+    pose[:3, 3] = -middle
     return Scene("no photographs", (View("middle", pose, 2048, 1024),), (), points, colors, "")
 
 

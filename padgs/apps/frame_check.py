@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from padgs.data.capture import DataError
 from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
 from padgs.evaluation.metrics import mean_color, sphere_weight, ws_psnr
 from padgs.evaluation.scoring import ONE_COLOR, Render
@@ -48,6 +49,8 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
         else:
             numbers = file.read_text().replace(",", " ").split()
         matrix = np.asarray(numbers, np.float64).reshape(-1, 4)
+    except DataError as error:  # which would be taken for one of the run's data
+        raise ValueError(str(error)) from error
     except (ValueError, TypeError, EOFError, OverflowError) as error:
         raise ValueError(
             f"--transform {text} is no file and no 12 or 16 numbers ({error}); give a 4x4 matrix that maps the file's "

@@ -28,11 +28,10 @@ def split(
     destination = Path(to or f"{os.path.abspath(source)}-blocks")  # also of "."
     options = DataOptions(mask=mask, split=split, images=images or None)
     with name_place(destination):
-        lines = write(Path(source), destination, blocks, format, options)
-    for line in lines:
-        show(line)
-    folders = (line.partition(": ")[0] for line in lines)
-    names = ",".join(f'"{folder}"' if "," in folder else folder for folder in folders)
+        written = write(Path(source), destination, blocks, format, options)
+    for folder, content in written.items():
+        show(f"{folder}: {content}")
+    names = ",".join(f'"{folder}"' if "," in folder else folder for folder in map(str, written))
     command = shlex.join(["padgs-run", "-m", f"data.path={names}", *(["data.split=all"] if split == "all" else [])])
     show(f"next: {command}, then padgs merge with the runs")
 

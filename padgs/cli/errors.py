@@ -75,8 +75,10 @@ def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) 
 
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    if run and isinstance(error, DataError) and not str(error).startswith(f"{run} "):  # a file of Gaussians
-        runs = " or ".join(filter(None, (run, beside)))
+    given = [*filter(None, (run, beside))]
+    is_of_a_file = str(error).startswith(tuple(f"{Path(one)} " for one in given))  # of Gaussians
+    if run and isinstance(error, DataError) and not is_of_a_file:
+        runs = " or ".join(given)
         return f"{error}; it is the data of {runs}: if it has moved, name its place with --data"
     return str(error) or "out of memory"
 

@@ -33,7 +33,7 @@ def export(
     from rich.console import Console
     from rich.text import Text
 
-    from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run
+    from padgs.apps.export.explicit import DISTILLATION_STEPS, UNSMOOTHED, export_run
     from padgs.apps.export.splat_file import check_suffix, write_splats
     from padgs.files import check_place
     from padgs.runs.load import load_run
@@ -59,7 +59,8 @@ def export(
         status.update(Text(f"writing {printable(path.name)}"))
         with name_place(path):
             lost = write_splats(path, found.splats, found.notes, start=found.start)
-    show("\n".join(f"  {note}" for note in filter(None, (*found.notes, lost))))
+    notes = [note for note in (*found.notes, lost) if note and (smooth or note != UNSMOOTHED)]
+    show("\n".join(f"  {note}" for note in notes))
     show(f"{path}: {len(found.splats)} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
 
 

@@ -43,6 +43,8 @@ def render(
     check_range(0.1, 179.9, fov=fov)
     check_range(2, MAX_SIDE, width=width or None)
     check_range(1, MAX_SIDE, height=height)
+    if camera == "panorama" and width % 2:
+        raise ValueError(f"--width is {width}; a panorama is 2:1, so it must be even")
     if seconds is not None and not 0 < seconds * fps <= MAX_FRAMES:
         raise ValueError(
             f"--seconds is {seconds:g}, which makes {seconds * fps:g} frames at --fps {fps:g}; it must be above 0 and "
@@ -50,6 +52,8 @@ def render(
         )
     with Console().status("opening the run") as status:
         found = open_model(run, data, rays, transform)
+        for note in found.notes:  # they may say that the frames would show nothing
+            show(f"  {note}")
         shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
         views = views_along(found, path, seconds, fps, width, shape)
         lens = views[0].camera
@@ -67,8 +71,6 @@ def render(
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),
             )
-    for note in getattr(found, "notes", ()):
-        show(f"  {note}")
     for written in outputs:
         show(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")
     if depth:

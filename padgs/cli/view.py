@@ -43,7 +43,7 @@ def view(
             wait_for_checkpoint(folder)
             stated = (rays, transform) if folder in files or not files else ()  # a run beside a file has its own
             runs.append(open_model(folder, place if folder in files else data, *stated))
-            for note in getattr(runs[-1], "notes", ()):
+            for note in runs[-1].notes:
                 show(f"  {note}")
         if len(names := [*dict.fromkeys(found.scene.name for found in runs)]) > 1:
             raise ValueError(f"{run} and {beside} are of two scenes, {' and '.join(names)}; name two runs of one scene")

@@ -60,6 +60,7 @@ class LoadedRun:
     iteration: int  # of the last checkpoint
     digest: str  # of the last checkpoint
     opened_with: tuple[str, ...] = field(default=(), kw_only=True)  # options of the command line
+    notes: tuple[str, ...] = field(default=(), kw_only=True)  # what its user should know
 
     @property
     def files(self) -> RunStore:
@@ -158,7 +159,8 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     backend is not for it is rendered by that of the device. A RunFolderError says that it is no run folder;
     CheckpointError, ResultError and ConfigError name a file that is damaged or of another version.
     """
-    store = RunStore(Path(folder))
+    path = Path(folder)
+    store = RunStore(path.resolve() if path.name in ("", "..") else path)  # names of files are made of the last part
     settings = store.path / results.CONFIG_NAME
     if not settings.is_file() or not store.has_checkpoint:
         found = f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}"

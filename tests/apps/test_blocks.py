@@ -157,10 +157,12 @@ def test_blocks_below_a_linked_folder_have_their_images_and_depth_maps(source, t
 
 def test_a_merged_model_has_of_each_run_what_lies_in_its_block(source, runs, capsys):
     path = merge(runs, Console(width=200))
-    assert f"padgs-run data.path={source} init={path} train.refine=true" in capsys.readouterr().out
+    assert (
+        f"padgs-run data.path={source} data.cameras=panoramas init={path} train.refine=true" in capsys.readouterr().out
+    )
     merged, loaded = padgs.load_run(path, device="cpu"), [padgs.load_run(one, device="cpu") for one in runs]
     assert merged.result.ok and merged.result.variant == "2 blocks, continued"
-    assert merged.config.data.path == str(source)
+    assert merged.config.data.path == str(source) and merged.config.data.cameras == "panoramas"
     assert len(merged.scene.test) == 4 and merged.score("sphere").metrics == merged.scores["sphere"].metrics
     assert merged.result.timing["cpu_seconds"] == sum(one.result.timing["cpu_seconds"] for one in loaded)
     means = merged.method.model.splats.means
@@ -247,7 +249,7 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
 def test_blocks_are_beside_the_working_folder_too(tmp_path, monkeypatch):
     (tmp_path / "capture").mkdir()
     monkeypatch.chdir(tmp_path / "capture")
-    monkeypatch.setattr(blocks, "split", lambda source, destination, *_: [f"{destination}: "])
+    monkeypatch.setattr(blocks, "split", lambda source, destination, *_: {destination: ""})
     done = CliRunner().invoke(app, ["split", ".", "--blocks", "2"])
     assert str(tmp_path / "capture-blocks") in done.output.replace("\n", "")
 

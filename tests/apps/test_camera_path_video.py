@@ -150,6 +150,7 @@ def test_written_depths_can_be_read_as_depth_maps(npy, tmp_path):
         *((("--fps", value), f"--fps is {float(value)}; it must be from 0.01 to 1000") for value in BAD_NUMBERS),
         *((("--seconds", value), f"--seconds is {float(value):g}, which makes") for value in BAD_NUMBERS),
         *((("--width", value), f"--width is {value}; it must be from 2 to 16384") for value in BAD_SIDES),
+        (("--width", "31"), "--width is 31; a panorama is 2:1, so it must be even"),
         *(
             (("--camera", "perspective", "--height", value), f"--height is {value}; it must be from 1 to 16384")
             for value in ("0", *BAD_SIDES)

@@ -165,6 +165,22 @@ def test_nerfstudio_s_world_is_suggested(run, splats, tmp_path):
     assert as_numbers(given) == as_numbers(found.suggestion)
 
 
+def test_a_faulty_file_of_nerfstudio_s_world_is_named(tmp_path):
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": torch.eye(4)[:3].tolist()}))
+    with pytest.raises(ValueError, match="scale") as raised:
+        read_transform(str(file))
+    assert not isinstance(raised.value, DataError) and "is no file" not in str(raised.value)
+
+
+def test_a_single_gaussian_is_seen_from_before_it(tmp_path):
+    one = Splats(torch.tensor([[3.0, 4, 5]]), torch.full((1, 3), -2.0), torch.ones(1, 3), degree=0, opacity=0.9)
+    write_splats(tmp_path / "one.ply", one)
+    run = open_model(str(tmp_path / "one.ply"), device="cpu")
+    middle = replace(run.scene.train[0], width=64, height=32)
+    assert run.scene.scale > 0 and run.render(middle).alpha[16, 32] > 0.5
+
+
 def test_files_of_a_data_set_in_map_coordinates_are_read_in_any_of_its_worlds(tmp_path):
     """Local ones exactly; those in map coordinates as well as float32 holds them."""
     utm = torch.tensor([691_000.0, 5_334_000.0, 520.0], dtype=torch.float64)

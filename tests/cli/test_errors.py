@@ -121,15 +121,19 @@ def test_errors_are_one_line(error, message, capsys):
 
 def test_a_damaged_file_of_gaussians_is_not_taken_for_the_data_of_a_run(capsys):
     @without_traceback
-    def command(run: str) -> None:
+    def command(run: str, beside: str = "") -> None:
         raise DataError("a.ply is no PLY file; export it again")
 
-    for run, more in (
-        ("a.ply", ""),
-        ("runs/a", "; it is the data of runs/a: if it has moved, name its place with --data"),
+    place = "if it has moved, name its place with --data"
+    for run, beside, more in (
+        ("a.ply", "", ""),
+        ("./a.ply", "", ""),
+        ("runs/a", "a.ply", ""),
+        ("runs/a", "", f"; it is the data of runs/a: {place}"),
+        ("runs/a", "runs/b", f"; it is the data of runs/a or runs/b: {place}"),
     ):
         with pytest.raises(RuntimeError):  # `typer.Exit`
-            command(run=run)
+            command(run=run, beside=beside)
         assert capsys.readouterr().err == f"error: a.ply is no PLY file; export it again{more}\n"
 
 

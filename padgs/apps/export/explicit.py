@@ -70,19 +70,14 @@ def export_run(
         if distillation_steps != DISTILLATION_STEPS:
             notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
     elif isinstance(model, AnchorModel):
+        _inside(model.anchors.centers(), crop)  # before the long work
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
     else:
         raise ValueError(f"{run.config.method} has no Gaussians to export; use padgs render or padgs view")
     if smooth:
         notes.append(UNSMOOTHED)
-    if crop is not None:
-        low, high = splats.means.new_tensor(crop).view(2, 3)
-        inside = ((splats.means >= low) & (splats.means <= high)).all(-1)
-        if not inside.any():
-            box, means = f"the box from {low.tolist()} to {high.tolist()}", splats.means
-            there = f"they are from {means.min(0).values.tolist()} to {means.max(0).values.tolist()}"
-            raise ValueError(f"no Gaussian lies in {box}; {there}, in the world of `padgs view`: change --crop")
+    if (inside := _inside(splats.means, crop)) is not None:
         notes.append(f"cropped to {int(inside.sum())} of {len(splats)} Gaussians")
         splats = deepcopy(splats)
         splats.load({name: rows[inside] for name, rows in splats.rows().items()})
@@ -111,6 +106,18 @@ def export_run(
         splats, start = transform_splats(splats, rotation), rotation(start)
         notes[notes.index(AXES)] = "units of the scene, rotated so that -y is up"
     return Exported(splats, tuple(notes), start)
+
+
+def _inside(means: Tensor, crop: Sequence[float] | None) -> Tensor | None:
+    """Return which means [N, 3] lie in a box, [N] bool; None without a box, and a ValueError if none does."""
+    if crop is None:
+        return None
+    low, high = means.new_tensor(crop).view(2, 3)
+    if (inside := ((means >= low) & (means <= high)).all(-1)).any():
+        return inside
+    box = f"the box from {low.tolist()} to {high.tolist()}"
+    there = f"they are from {means.min(0).values.tolist()} to {means.max(0).values.tolist()}"
+    raise ValueError(f"no Gaussian lies in {box}; {there}, in the world of `padgs view`: change --crop")
 
 
 def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:

@@ -116,16 +116,16 @@ class FilmControls:
             return
         poses = move_origin(torch.stack(self.keyframes), -self._origin.cpu())
         content = json.dumps({"keyframes": [{"cam_from_world": pose.tolist()} for pose in poses]}, indent=1).encode()
-        if not self._may_write:
-            self._client.send_file_download("film.json", content)
-            self.words.content = "downloaded: `padgs render RUN --path film.json` makes the video"
-            return
         names = (self._folder / f"film{'' if number == 1 else f'-{number}'}.json" for number in count(1))
-        file = next(name for name in names if not name.exists())
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(file, content)
-        except OSError as error:
-            self.words.content = f"cannot write {file}: {error.strerror or error}"
-            return
-        self.words.content = f"saved. `padgs render {self._words} --path {shlex.quote(str(file))}`"
+        reason = ""
+        if self._may_write:
+            try:
+                file = next(name for name in names if not name.exists())
+                self._folder.mkdir(parents=True, exist_ok=True)
+                write_atomically(file, content)
+                self.words.content = f"saved. `padgs render {self._words} --path {shlex.quote(str(file))}`"
+                return
+            except OSError as error:
+                reason = f"cannot write into {self._folder}: {error.strerror or error}; "
+        self._client.send_file_download("film.json", content)
+        self.words.content = f"{reason}downloaded: `padgs render RUN --path film.json` makes the video"

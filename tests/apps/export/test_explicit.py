@@ -13,6 +13,7 @@ from support.tiny_scene import tiny_scene
 from typer.testing import CliRunner
 
 import padgs
+from padgs.apps.export import explicit
 from padgs.apps.export.explicit import UNSMOOTHED, UP, export_run, harmonics_rotation, transform_splats
 from padgs.apps.export.splat_file import read_splats
 from padgs.cli.commands import app
@@ -108,6 +109,22 @@ def test_a_box_is_cropped(splat_run, tmp_path):
     ):
         result = export(str(splat_run), "--crop", box, "--to", str(tmp_path / "d.ply"))
         assert result.exit_code == 1 and message in result.output + result.stderr
+
+
+def test_an_empty_box_is_found_before_the_long_work(tmp_path_factory, monkeypatch):
+    run = padgs.load_run(tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=2"))
+    monkeypatch.setattr(explicit, "_bake_and_distill", lambda *_: pytest.fail("baked"))
+    with pytest.raises(ValueError, match="no Gaussian lies in the box"):
+        explicit.export_run(run, crop=(800, 0, 0, 900, 1, 1))
+
+
+def test_smoothing_that_nobody_asked_for_needs_no_note(tmp_path_factory, tmp_path, monkeypatch):
+    run = tiny_run(tmp_path_factory, "method=omnigs", "train.iterations=2")
+    monkeypatch.setattr("padgs.apps.export.splat_file.check_suffix", lambda path: None)
+    monkeypatch.setattr("padgs.apps.export.splat_file.write_splats", lambda path, *_, **__: path.write_text(""))
+    for options, shown in (((), False), (("--smooth",), True)):
+        result = export(str(run), "--to", str(tmp_path / "a.html"), *options)
+        assert result.exit_code == 0 and ("--smooth changes nothing" in result.output) == shown, result.output
 
 
 def test_upright_worlds(splat_run, tmp_path):

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from unittest.mock import MagicMock
 
@@ -120,3 +121,14 @@ def test_saved_films_are_paths_in_the_world_of_the_data(tmp_path):
     assert film.words.content == f"saved. `padgs render a.ply --data D --path {tmp_path / 'film-2.json'}`"
     found = move_origin(read_path(tmp_path / "film.json", 2, (0, 0, 1)), origin)
     assert torch.allclose(found, torch.stack(poses))
+
+
+def test_a_film_that_cannot_be_saved_is_downloaded(tmp_path):
+    (tmp_path / "file").touch()
+    client, pose = MagicMock(), torch.eye(4, dtype=torch.float64)
+    film = FilmControls(client, tmp_path / "file" / "run", "a.ply", torch.zeros(3), lambda: pose, True)
+    film.keyframes.extend((pose, pose))
+    film.save()
+    (name, content), _ = client.send_file_download.call_args
+    assert name == "film.json" and len(json.loads(content)["keyframes"]) == 2
+    assert film.words.content.startswith("cannot write into") and "downloaded" in film.words.content
