@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
+from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -37,6 +38,11 @@ def listed(names: Iterable[object], most: int = 5) -> str:
     names = [str(name) for name in names]
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def folded(path: Path | PurePosixPath | str) -> str:
+    """Return a path as it is compared: without case, in one Unicode form."""
+    return normalize("NFC", PurePosixPath(path).as_posix()).casefold()
 
 
 def by_id(pairs: Iterable[tuple[Any, Any]], where: str) -> dict[Any, Any]:

@@ -13,7 +13,7 @@ import padgs.data
 from padgs.data import conventions
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
-from padgs.data.capture import Capture, DataError, DataOptions, Progress, listed, view_name
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Progress, listed, view_name
 from padgs.data.cloud import GREY_POINTS
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
@@ -77,20 +77,21 @@ def check(
         report.problems.append(str(error))
         return report
     report.format = capture.format
-    digests = _check_images(capture, report, progress)
+    used = [frame for frame in capture.frames if frame.lens is None or options.cameras != "panoramas"]
+    digests = _check_images(used, report, progress)
     damaged = bool(report.problems)
     if (scene := _assemble(capture, options, report)) is None:
         return report
     views = (*scene.train, *scene.test)
     poses = torch.stack([view.cam_from_world for view in views])
     report.train, report.test = len(scene.train), len(scene.test)
-    report.unused = len(capture.frames) - report.train - report.test
+    report.unused = len(used) - report.train - report.test
     report.points, report.coloured = len(scene.points), not any(GREY_POINTS in note for note in scene.notes)
     sizes = sorted({(view.width, view.height) for view in views})
     report.resolution = listed(f"{width}x{height}" for width, height in sizes)
     report.notes += scene.notes
     report.gravity = gravity(poses)
-    ordered = sorted(capture.frames, key=lambda frame: frame.name)
+    ordered = sorted(used, key=lambda frame: frame.name)
     report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
     report.median_depth = median_depth(poses, scene.points)
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
@@ -136,10 +137,10 @@ def _check_depth(scene: Scene, report: Report) -> None:
     report.problems.append(f"{text}, and are about {scale:.2g} times as far; {remedy}")
 
 
-def _check_images(capture: Capture, report: Report, progress: Progress) -> dict[str, str]:
+def _check_images(frames: Sequence[Frame], report: Report, progress: Progress) -> dict[str, str]:
     """Decode all images, so that damaged files are found before training; return the digests of files by view."""
     digests = {}
-    for done, frame in enumerate(capture.frames):
+    for done, frame in enumerate(frames):
         if frame.image.is_file():  # missing ones are reported together
             try:
                 digests[view_name(frame.name)] = inspect(frame.image, panorama=frame.lens is None).digest
@@ -148,7 +149,7 @@ def _check_images(capture: Capture, report: Report, progress: Progress) -> dict[
                     refuse_dual_fisheye(pixels, frame.image)
             except DataError as error:
                 report.problems.append(str(error))
-        progress(done + 1, len(capture.frames))
+        progress(done + 1, len(frames))
     return digests
 
 

@@ -10,8 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
-from pathlib import Path, PurePath, PurePosixPath
-from unicodedata import normalize
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.checks import install_command
-from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, first_of, listed
+from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, first_of, folded, listed
 from padgs.data.images import read_bytes, refused_if_damaged
 from padgs.files import open_image
 from padgs.scene import View
@@ -159,12 +158,12 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
     for folder in dict.fromkeys(folder for folder in usual if folder):
         inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
         maps = [path for end in reversed(EXTENSIONS) for path in inside if path.suffix.lower() == end]  # the best last
-        there = {_folded(path.relative_to(folder).with_suffix("")): path for path in maps}
+        there = {folded(path.relative_to(folder).with_suffix("")): path for path in maps}
         files = {}
         for frame in capture.frames:
             image = PurePosixPath(frame.name)
             names = (image.stem, image.name, f"{image.stem}_depth", f"depth_{image.stem}")
-            keys = (_folded(image.with_name(name)) for name in names)
+            keys = (folded(image.with_name(name)) for name in names)
             if found := next((there[key] for key in keys if key in there), None):
                 files[frame.name] = found
         if files:
@@ -184,11 +183,6 @@ def _may_be_whole(file: Path) -> bool:
         return file.suffix.lower() != ".exr"
     with refused_if_damaged(file):
         return np.load(file, mmap_mode="r", allow_pickle=False).dtype.kind in "iu"
-
-
-def _folded(name: PurePath) -> str:
-    """Return a name as it is compared: without case, in one Unicode form."""
-    return normalize("NFC", name.as_posix()).casefold()
 
 
 def _stated(file: Path, may_be_whole: bool) -> DepthMeaning:

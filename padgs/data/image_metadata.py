@@ -117,6 +117,8 @@ def crop_of(image: Image.Image, path: object, within: Crop | None = None) -> Cro
         )
     except (ValueError, OverflowError) as error:
         raise DataError(contradiction) from error
+    if (image.width, image.height) == (full_width, full_height):
+        return None  # filled up to the whole panorama since
     is_inside = min(left, top) >= 0 and left + width <= full_width <= _WIDEST and top + height <= full_height <= _WIDEST
     # Another program may have resized the picture, but not changed its proportions.
     if not is_inside or min(width, height) < 1 or abs(image.width * height / (image.height * width) - 1) > 0.02:

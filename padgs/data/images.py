@@ -66,7 +66,12 @@ def inspect(path: Path, *, mask: bool = False, panorama: bool = True, within: Cr
         image_metadata.refuse_several_pictures(image, path)
         mode = image.mode
         _refuse_other_modes(image, data, path, mask)
-        crop = crop_of(image, path, within) if panorama else None
+        crop = crop_of(image, path, within)
+        if crop is not None and not panorama:
+            raise DataError(
+                f"{path} is a photograph, and says that it is a part of a panorama; remove the metadata "
+                "(`exiftool -xmp:all= FILE`)"
+            )
         conversion = None if mask else image_metadata.srgb_conversion(image, data, path)
         size = (image.width, image.height) if crop is None else (crop.full_width, crop.full_height)
         may_be_transparent = mode in _ALPHA or "transparency" in image.info

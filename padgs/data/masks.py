@@ -4,18 +4,18 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 `data.mask=inverted` (or inverted:FOLDER) reads files in which 255 marks what to ignore.
 """
 
+import glob
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from statistics import median
-from unicodedata import normalize
 
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture, DataError, first_of, listed
+from padgs.data.capture import Capture, DataError, first_of, folded, listed
 from padgs.data.image_metadata import Crop
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
@@ -182,8 +182,9 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         beside = first_of(given.parent, MASK_FOLDERS, Path.is_dir) if given.parent == capture.folder else None
         unused = f"; {beside.name}/ is not used (data.mask={beside.name} uses it)" if beside else ""
         return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}{unused}"
-    beside, listings = given == capture.image_folder, {}
-    found = {frame.name: path for frame in capture.frames if (path := _in_folder(given, frame.name, beside, listings))}
+    beside, inside = given == capture.image_folder, sorted(glob.glob("**/*", root_dir=given, recursive=True))
+    files = {folded(path): given / path for path in inside}
+    found = {frame.name: path for frame in capture.frames if (path := _in_folder(files, frame.name, beside))}
     if beside and not found:
         others = [path.name for path in sorted(capture.folder.glob("*")) if re.search("mask|segm", path.name, re.I)]
         return {}, f"masks: not used: {listed(others)}; name one with data.mask" if others else None
@@ -224,16 +225,12 @@ def is_of_masks(name: str) -> bool:
     return any(re.search(r"(?i)(?<![a-z])masks?(?![a-z])", part) for part in PurePosixPath(name).parts[:-1])
 
 
-def _in_folder(folder: Path, name: str, beside: bool, listings: dict[Path, dict[str, Path]]) -> Path | None:
-    """Return the mask of an image in a folder, in any case and Unicode form; `listings` caches what folders hold."""
+def _in_folder(files: Mapping[str, Path], name: str, beside: bool) -> Path | None:
+    """Return the mask of an image among the files of a folder by folded path: in any case and Unicode form."""
     stem = PurePosixPath(name).with_suffix("")
     first, *others = masks_beside(name)
     for candidate in [first, *([] if beside else [f"{stem}{end}" for end in (".png", *EXTENSIONS)]), *others]:
-        parent = (folder / candidate).parent
-        if parent not in listings:
-            files = [file for file in parent.iterdir() if file.is_file()] if parent.is_dir() else []
-            listings[parent] = {normalize("NFC", file.name).casefold(): file for file in files}
-        if file := listings[parent].get(normalize("NFC", PurePosixPath(candidate).name).casefold()):
+        if (file := files.get(folded(candidate))) and file.is_file():
             return file
     return None
 

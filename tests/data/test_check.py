@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from padgs.cli.commands import app
 from padgs.data import load
+from padgs.data.capture import DataOptions
 from padgs.data.check import check
 
 
@@ -163,6 +164,35 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert run(app, ["check", str(tmp_path / "absent"), "--overlay", "none"]).exit_code == 1
     assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).stderr
     assert "unknown data.cameras 'x'" in run(app, ["check", str(folder), "--cameras", "x"]).stderr
+
+
+def test_images_that_are_left_out_are_no_problem(world: World, tmp_path: Path) -> None:
+    write_transforms(world, tmp_path)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    meta["frames"][2] |= {"camera_model": "PINHOLE", "fl_x": 50, "fl_y": 50, "cx": 32, "cy": 16, "w": 64, "h": 32}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    (tmp_path / meta["frames"][2]["file_path"]).write_bytes(b"damaged")
+    options = DataOptions(split="all", cameras="panoramas")
+    report = check(tmp_path, options=options)
+    assert report.problems == [] and (report.train, report.unused) == (5, 0)
+    problems = check(tmp_path, options=replace(options, cameras="all")).problems
+    assert any("pano_02.png is not an image" in problem for problem in problems)
+
+
+def test_mount_points_are_refused_at_once_and_links_are_followed(world: World, tmp_path: Path, monkeypatch) -> None:
+    write_colmap_text(world, tmp_path / "a")
+    (tmp_path / "far").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "far")
+    run = CliRunner().invoke
+    assert run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "link"), "--to", "colmap"]).exit_code == 0
+    assert (tmp_path / "link").is_symlink() and len(load(tmp_path / "far").train) == 4
+    monkeypatch.setattr(Path, "is_mount", lambda self: self.name == "out")
+    for command in (
+        ("convert", tmp_path / "a", tmp_path / "out", "--to", "colmap"),
+        ("prepare", tmp_path / "a/images", tmp_path / "out"),
+    ):
+        refused = run(app, [*map(str, command)])
+        assert refused.exit_code == 1 and "is a mount point, which nothing can replace; name a new" in refused.stderr
 
 
 def test_the_convert_command(world: World, tmp_path: Path) -> None:

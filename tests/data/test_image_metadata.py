@@ -91,6 +91,16 @@ def test_sizes_of_a_part_are_scaled_with_the_picture_and_a_whole_panorama_is_no_
     assert found.crop is None and (found.width, found.height) == (128, 64)
     PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**whole))
     assert inspect(tmp_path / "a.jpg").crop is None, "resized, and no part is stated"
+    for height in (32, 63):  # was stated before the picture was filled up
+        stated = {"FullPanoWidthPixels": 128, "FullPanoHeightPixels": 64, "CroppedAreaImageHeightPixels": height}
+        PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**stated, CroppedAreaImageWidthPixels=2 * height))
+        assert inspect(tmp_path / "a.jpg").crop is None
+
+
+def test_a_photograph_is_no_part_of_a_panorama(tmp_path):
+    PANORAMA.save(tmp_path / "a.jpg", xmp=xmp(**GPANO))
+    with pytest.raises(DataError, match="is a photograph, and says that it is a part of a panorama; remove the"):
+        inspect(tmp_path / "a.jpg", panorama=False)
 
 
 @pytest.mark.parametrize(

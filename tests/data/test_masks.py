@@ -71,6 +71,21 @@ def test_habits_of_other_programs(file: str, folder: Path) -> None:
     assert not any("no pose" in note for note in scene.notes)
 
 
+def test_subfolders_are_the_same_in_any_case_and_unicode_form(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    listing, images = tmp_path / "sparse/0/images.txt", tmp_path / "images"
+    text = listing.read_text()
+    for name, folder in zip((world.names[0], world.names[3]), ("K\u00fcche", "Cam1"), strict=True):
+        (images / folder).mkdir()
+        (images / f"{name}.png").rename(images / folder / f"{name}.png")
+        text = text.replace(f"{name}.png", f"{folder}/{name}.png")
+    listing.write_text(text)
+    (tmp_path / "masks").mkdir()
+    _mask(tmp_path / "masks" / "Ku\u0308che" / f"{world.names[0]}.png")
+    _mask(tmp_path / "masks" / "cam1" / f"{world.names[3]}.png")
+    assert any("masks/ for 2 of 6 views" in note for note in load(tmp_path).notes)
+
+
 def test_masks_in_folders_of_other_names_are_noted(folder: Path) -> None:
     _mask(folder / "sam_masks" / "pano_00.png")
     assert "masks: not used: sam_masks; name one with data.mask" in load(folder).notes

@@ -5,6 +5,7 @@ files hold panoramas, poses and points.
 """
 
 import csv
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -130,6 +131,10 @@ def _frame(image: Any, where: str, folder: Path, name: str, since: float, edited
     if not image.isDefined("sphericalRepresentation"):
         return None
     sphere = image["sphericalRepresentation"]
+    sizes = ("imageWidth", "pixelWidth")  # pixels, radians a pixel
+    turn = math.prod(sphere[of].value() for of in sizes) if all(map(sphere.isDefined, sizes)) else 0.0
+    if turn > 0 and abs(turn / (2 * math.pi) - 1) > 0.01:
+        return None  # a part of the sphere
     kind = next((kind for kind in ("jpegImage", "pngImage") if sphere.isDefined(kind)), None)
     if kind is None:
         raise DataError(f"{where} has neither jpegImage nor pngImage; export the panoramas as JPEG")

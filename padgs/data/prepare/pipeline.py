@@ -92,6 +92,8 @@ def prepare(
 
 def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
     """Return the result of an earlier call; None if the destination is free, a DataError if something else is there."""
+    if destination.name and destination.is_mount():
+        raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
         return None
     if result := work.find_result(source, destination, options):

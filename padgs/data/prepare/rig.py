@@ -71,15 +71,6 @@ def view_name(index: int, name: str) -> str:
     return f"{index:02d}/{name}.png"
 
 
-def split_name(view: str) -> tuple[int, str]:
-    """Invert `view_name`.
-
-    >>> split_name("03/kitchen.jpg.png")
-    (3, 'kitchen.jpg')
-    """
-    return int(view[:2]), view[3:].removesuffix(".png")
-
-
 def rig_config() -> Any:
     """Return the rig for pycolmap: the first view is its reference, all share one centre."""
     pycolmap = pycolmap_module()
@@ -107,7 +98,7 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
     for image in model.images.values():
         if not image.has_pose:
             continue
-        view, name = split_name(image.name)
+        view, name = int(image.name[:2]), image.name[3:].removesuffix(".png")  # of `view_name`
         matrix = torch.from_numpy(np.array(image.cam_from_world().matrix()))
         poses.setdefault(name, rigid(rotations[view].mT @ matrix[:, :3], rotations[view].mT @ matrix[:, 3]))
         if with_point := [point for point in image.points2D if point.has_point3D()]:

@@ -205,17 +205,19 @@ def e57(world: World, tmp_path: Path) -> Path:
     return write_e57(world, tmp_path / "scan.e57")
 
 
-def write_e57(world: World, path: Path, pose: str = "translation", kind: str = "sphericalRepresentation") -> Path:
+def write_e57(
+    world: World, path: Path, pose: str = "translation", kind: str = "sphericalRepresentation", turn: float = 0.0
+) -> Path:
     """Write points with a pose of their own, and panoramas; `pose` and `kind` name the elements."""
     pye57 = importlib.import_module("pye57")
     lib = pye57.libe57
     file = pye57.E57(str(path), mode="w")
     image_file = file.image_file
-    turn, shift = np.array([0.5, 0.5, 0.5, 0.5]), np.array([1.0, 2.0, 3.0])  # x to y to z
+    rotation, shift = np.array([0.5, 0.5, 0.5, 0.5]), np.array([1.0, 2.0, 3.0])  # x to y to z
     local = (world.points - shift) @ np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     data = {f"cartesian{axis}": column.copy() for axis, column in zip("XYZ", local.T, strict=True)}
     data |= {f"color{name}": c.copy() for name, c in zip(("Red", "Green", "Blue"), world.colors.T, strict=True)}
-    file.write_scan_raw(data, rotation=turn, translation=shift)
+    file.write_scan_raw(data, rotation=rotation, translation=shift)
     images = file.root["images2D"]
     if not (path.parent / "made").exists():
         write_images(world, path.parent / "made")
@@ -235,6 +237,9 @@ def write_e57(world: World, path: Path, pose: str = "translation", kind: str = "
         numbers(stated, pose, "xyz", world.centers[i])
         numbers(stated, "rotation", "wxyz", quaternion(PANORAMA.T @ world.rotations[i], inverse=True))
         image.set(kind, sphere)
+        if turn:
+            sphere.set("imageWidth", lib.IntegerNode(image_file, 64))
+            sphere.set("pixelWidth", lib.FloatNode(image_file, turn / 64))
         content = (path.parent / "made" / f"{name}.png").read_bytes()
         blob = lib.BlobNode(image_file, len(content))
         sphere.set("pngImage", blob)
@@ -301,6 +306,10 @@ def test_e57_files_without_panoramas_or_poses_are_refused(e57: Path, world: Worl
     with pytest.raises(DataError, match=r"c.e57 holds no panorama \(images2D with a sphericalRepresentation\)"):
         read(e57.with_name("c.e57"))
     assert len(read_cloud(e57.with_name("c.e57"))[0].points) == 400
+    write_e57(world, e57.with_name("d.e57"), turn=np.pi)
+    with pytest.raises(DataError, match="d.e57 holds no panorama"):
+        read(e57.with_name("d.e57"))
+    assert len(read(write_e57(world, e57.with_name("e.e57"), turn=2 * np.pi)).frames) == 6
     e57.write_bytes(e57.read_bytes()[:3000])
     with pytest.raises(DataError, match="scan.e57 is cut short, damaged or of another kind"):
         read(e57)

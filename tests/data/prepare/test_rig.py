@@ -58,7 +58,6 @@ def test_files_and_masks_of_views(tmp_path):
     assert calls == [(1, 1)]
     for index in range(12):
         name = rig.view_name(index, "a.png")
-        assert rig.split_name(name) == (index, "a.png")
         assert np.asarray(Image.open(tmp_path / "views" / name)).shape == (20, 20, 3)
         used[index] = (np.asarray(Image.open(tmp_path / "masks" / f"{name}.png")) > 0).mean()
     assert max(used[index] for index in range(4)) == 0  # the upper row lies above the horizon
