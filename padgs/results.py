@@ -242,8 +242,10 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     unsafe in a path or command (a digest is no signature, and files may come from elsewhere).
     """
     document = dict(document)
-    if document.pop("schema") != SCHEMA:
-        raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); delete it and run again")
+    if (schema := document.pop("schema")) != SCHEMA:
+        is_newer = isinstance(schema, int) and schema > SCHEMA
+        advice = "read it with a newer padgs" if is_newer else "delete it and run again"
+        raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); {advice}")
     digest = document.pop("sha256", None)
     try:
         edited = digest != _digest(document)

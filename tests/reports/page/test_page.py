@@ -47,6 +47,11 @@ def test_the_mean_after_equal_time_is_the_first_chart():
     assert charts < first < second and 'download="equal_time.csv"' in html and '<select id="set"' in html
 
 
+def test_the_page_is_about_the_runs_that_were_asked_for():
+    made = page.html(run_set(compared(["synthetic-room", "synthetic-outdoor"], 1), scenes=("synthetic-room",)))
+    assert "synthetic-outdoor" not in made and f"{len(compared(['synthetic-room'], 1))} runs" in made
+
+
 def test_scenes_can_be_chosen_by_set_and_by_name():
     own = [
         replace(one, dataset="", scene="plaza", fingerprint="da838962d5", run=f"own{one.run}")
