@@ -115,6 +115,14 @@ def test_the_average_is_over_the_scenes_that_were_run_for_the_paper_too():
     assert set(rows["OP43DGS"][1:]) == {MISSING}, "out of memory"
 
 
+def test_a_scene_that_ran_in_two_sizes_is_not_called_one_that_was_not_run():
+    some = [run for run in data_set("roam360") if run.scene in ("bar", "lab", "canteen")]
+    wider = [replace(run, run=f"{run.run}_wide", width=3840, height=1920) for run in some if run.scene == "bar"]
+    (notes,) = [table.notes for table in [run_set([*some, *wider]).report("table1")]]
+    assert "360Roam, in no mean, as its runs differ: bar." in notes
+    assert not any("not run" in note and "bar" in note.partition("not run")[2] for note in notes)
+
+
 def test_any_scenes_have_a_mean_and_nothing_of_the_paper_unless_its_data_sets_were_run():
     mine = [
         replace(run, dataset="", scene=f"my_{run.scene}", config={**run.config, "data": {"path": run.scene}})

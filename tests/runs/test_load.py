@@ -31,6 +31,13 @@ def folder(tmp_path_factory):
     return tiny_run(tmp_path_factory)
 
 
+def test_a_run_has_its_name_wherever_one_stands(folder, monkeypatch):
+    (folder / "renders").mkdir(exist_ok=True)
+    for place, path in ((folder, "."), (folder / "renders", "..")):
+        monkeypatch.chdir(place)
+        assert padgs.load_run(path, device="cpu").folder.name == folder.name
+
+
 def test_an_opened_run_shows_and_scores_what_was_trained(folder):
     run = padgs.load_run(folder, device="cpu")
     assert run.result == read(folder / "result.json") and run.scores == run.result.scores
