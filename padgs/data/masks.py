@@ -4,7 +4,6 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 `data.mask=inverted` (or inverted:FOLDER) reads files in which 255 marks what to ignore.
 """
 
-import glob
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -182,8 +181,9 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         beside = first_of(given.parent, MASK_FOLDERS, Path.is_dir) if given.parent == capture.folder else None
         unused = f"; {beside.name}/ is not used (data.mask={beside.name} uses it)" if beside else ""
         return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}{unused}"
-    beside, inside = given == capture.image_folder, sorted(glob.glob("**/*", root_dir=given, recursive=True))
-    files = {folded(path): given / path for path in inside}
+    beside, inside = given == capture.image_folder, os.walk(given, followlinks=True)
+    paths = sorted(Path(folder, name) for folder, _, names in inside for name in names)
+    files = {folded(path.relative_to(given).as_posix()): path for path in paths}
     found = {frame.name: path for frame in capture.frames if (path := _in_folder(files, frame.name, beside))}
     if beside and not found:
         others = [path.name for path in sorted(capture.folder.glob("*")) if re.search("mask|segm", path.name, re.I)]

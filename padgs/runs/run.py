@@ -17,9 +17,9 @@ from rich.console import Console
 
 from padgs import clock, data, results
 from padgs.baselines import METHODS, distribution
-from padgs.checks import lookup, lpips_packages
+from padgs.checks import lookup
 from padgs.data.capture import DataError
-from padgs.evaluation.lpips import NO_WEIGHTS
+from padgs.evaluation.lpips import NO_WEIGHTS, has_weights
 from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
 from padgs.results import STATUSES, STOP_REQUESTED, Result
@@ -309,11 +309,11 @@ def _unscored(config: RunConfig, scene: Scene, result: Result) -> dict[str, Prot
     """Return the protocols under whose rules a run that did not fail has no scores of its test views, if any."""
     asked = config.protocols.items() if result.status not in RETRIED and scene.test else ()
     known = {name: scores.protocol for name, scores in result.scores.items()}
-    late = {name for name, of in result.scores.items() if lpips_packages() and NO_WEIGHTS in "".join(of.notes)}
+    late = {name for name, of in result.scores.items() if NO_WEIGHTS in "".join(of.notes)}
     return {
         name: rules
         for name, rules in asked
-        if name not in known or not _covers(known[name], _stored(rules)) or (name in late and rules.lpips != "none")
+        if name not in known or not _covers(known[name], _stored(rules)) or (name in late and has_weights(rules.lpips))
     }
 
 
@@ -351,7 +351,7 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
     complete = replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
     if unscored := _unscored(config, scene, result):
         _refuse_other_rules(store, result, unscored)
-        say(console, "finished before; only the new protocol is missing")
+        say(console, "finished before; only scores are missing")
         if not store.has_checkpoint:  # an untrained method would be scored
             raise RunFolderError(
                 f"{store.path} has a result but no checkpoint any more, so it cannot be scored under other "

@@ -164,13 +164,12 @@ def test_scores_are_not_replaced_by_those_under_other_rules_of_the_same_name(con
 def test_lpips_that_lacked_weights_is_added_once_there_are_some(config, monkeypatch):
     asked = replace(config, protocols=composed("protocol=paper").protocols)
     monkeypatch.setattr(lpips, "_load", lambda *_: "none")
-    monkeypatch.setattr(pipeline, "lpips_packages", lambda: [])
     without, _ = run(asked)
     assert without.scores["paper"].metrics["lpips_vgg_01"] is None
     monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
     monkeypatch.setattr(pipeline, "scored", lambda *_: pytest.fail("scored again"))
     assert run(asked)[0] == without
-    monkeypatch.setattr(pipeline, "lpips_packages", lambda: ["lpips"])
+    monkeypatch.setattr(pipeline, "has_weights", lambda net: net == "vgg")
     monkeypatch.setattr(evaluate, "lpips", lambda *_, **__: torch.tensor(0.25))
     assert run(asked)[0].scores["paper"].metrics["lpips_vgg_01"] == 0.25
     assert run(asked)[1].count("nothing to do") == 1

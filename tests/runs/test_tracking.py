@@ -128,19 +128,6 @@ def test_a_folder_of_a_run_is_mirrored_whatever_its_name(tmp_path, monkeypatch):
     assert done.exit_code == 1 and f"there is no folder {tmp_path / 'rums'}" in done.output
 
 
-def test_a_run_of_two_experiments_is_mirrored_into_each(tmp_path, monkeypatch):
-    run = make_run(tmp_path)
-    results.write(replace(results.read(run / "result.json"), experiments=("order", "tau")), run)
-    mirrored = []
-
-    def tracker(_, __, experiment: str, *___):
-        return SimpleNamespace(name=experiment, on=True, add=lambda folder: mirrored.append((experiment, folder)))
-
-    monkeypatch.setattr(tracking, "Tracker", tracker)
-    done = CliRunner().invoke(app, ["track", str(tmp_path)])
-    assert done.exit_code == 0 and mirrored == [("order", run), ("tau", run)] and "1 runs, as order, tau" in done.output
-
-
 @pytest.mark.slow
 @NEEDS_MLFLOW
 def test_runs_of_a_cluster_are_mirrored_later(tmp_path, monkeypatch):

@@ -61,7 +61,7 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
             written = splats if path.suffix.lower() == ".html" else read_splats(made, scratch=folder)
         except ValueError as error:
             raise ValueError(f"{path} cannot be written ({error}); name another place, or write a .ply") from error
-        lost = _lost(splats, written, path)
+        lost = "" if path.suffix.lower() == ".html" else _lost(splats, written, path)
         check_place(path)
         os.replace(made, path)
     return lost

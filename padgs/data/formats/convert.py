@@ -1,5 +1,6 @@
 """Conversion between formats: read and check everything, write to a temporary folder, then rename it."""
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -38,10 +39,10 @@ def convert(
     """
     if to not in WRITERS:
         raise ValueError(f"unknown format {to!r}; known: {', '.join(WRITERS)}")
-    if destination.name and destination.is_mount():
-        raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if destination.is_symlink():
         destination = destination.resolve()
+    if destination.name and os.path.ismount(destination):
+        raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another path")
     capture = padgs.data.read(source, format, options)

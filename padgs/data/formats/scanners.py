@@ -94,11 +94,11 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
             clouds.append(cloud)
             notes += more
     if others:
-        notes.append(f"{len(others)} images of {named} are no panoramas and are not used: {listed(others)}")
+        notes.append(f"{len(others)} images of {named} are no whole panoramas and are not used: {listed(others)}")
     if not frames:
         raise DataError(
-            f"{named} holds no panorama (images2D with a sphericalRepresentation); export panoramas and their poses "
-            "too, or use the file as points of another data set (data.points)"
+            f"{named} holds no whole panorama (images2D with a sphericalRepresentation); export panoramas and their "
+            "poses too, or use the file as points of another data set (data.points)"
         )
     notes.append(f"images: {len(frames)} panoramas of {named}, written beside it")
     if edited:
@@ -133,7 +133,7 @@ def _frame(image: Any, where: str, folder: Path, name: str, since: float, edited
     sphere = image["sphericalRepresentation"]
     sizes = ("imageWidth", "pixelWidth")  # pixels, radians a pixel
     turn = math.prod(sphere[of].value() for of in sizes) if all(map(sphere.isDefined, sizes)) else 0.0
-    if turn > 0 and abs(turn / (2 * math.pi) - 1) > 0.01:
+    if turn > 0 and all(abs(turn / whole - 1) > 0.01 for whole in (2 * math.pi, 360)):  # some state degrees
         return None  # a part of the sphere
     kind = next((kind for kind in ("jpegImage", "pngImage") if sphere.isDefined(kind)), None)
     if kind is None:

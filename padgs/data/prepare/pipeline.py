@@ -4,6 +4,7 @@ Works in a hidden folder beside the destination, so that an interrupted call can
 when it is complete.
 """
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -92,7 +93,7 @@ def prepare(
 
 def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
     """Return the result of an earlier call; None if the destination is free, a DataError if something else is there."""
-    if destination.name and destination.is_mount():
+    if destination.name and os.path.ismount(destination):
         raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
         return None

@@ -303,11 +303,11 @@ def test_e57_files_without_panoramas_or_poses_are_refused(e57: Path, world: Worl
     ):
         read(e57.with_name("b.e57"))
     write_e57(world, e57.with_name("c.e57"), kind="pinholeRepresentation")
-    with pytest.raises(DataError, match=r"c.e57 holds no panorama \(images2D with a sphericalRepresentation\)"):
+    with pytest.raises(DataError, match=r"c.e57 holds no whole panorama \(images2D with a sphericalRepresentation\)"):
         read(e57.with_name("c.e57"))
     assert len(read_cloud(e57.with_name("c.e57"))[0].points) == 400
     write_e57(world, e57.with_name("d.e57"), turn=np.pi)
-    with pytest.raises(DataError, match="d.e57 holds no panorama"):
+    with pytest.raises(DataError, match="d.e57 holds no whole panorama"):
         read(e57.with_name("d.e57"))
     assert len(read(write_e57(world, e57.with_name("e.e57"), turn=2 * np.pi)).frames) == 6
     e57.write_bytes(e57.read_bytes()[:3000])
