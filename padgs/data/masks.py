@@ -181,9 +181,13 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         beside = first_of(given.parent, MASK_FOLDERS, Path.is_dir) if given.parent == capture.folder else None
         unused = f"; {beside.name}/ is not used (data.mask={beside.name} uses it)" if beside else ""
         return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}{unused}"
-    beside, inside = given == capture.image_folder, os.walk(given, followlinks=True)
-    paths = sorted(Path(folder, name) for folder, _, names in inside for name in names)
-    files = {folded(path.relative_to(given).as_posix()): path for path in paths}
+    beside, files = given == capture.image_folder, dict[str, Path]()
+    deepest = max(len(PurePosixPath(frame.name).parts) for frame in capture.frames)
+    for folder, folders, names in os.walk(given, followlinks=True):
+        inside = Path(folder).relative_to(given)
+        if len(inside.parts) >= deepest:  # in masks/ beside the deepest image; links may go round in circles
+            folders.clear()
+        files |= {folded(inside / name): Path(folder, name) for name in names}
     found = {frame.name: path for frame in capture.frames if (path := _in_folder(files, frame.name, beside))}
     if beside and not found:
         others = [path.name for path in sorted(capture.folder.glob("*")) if re.search("mask|segm", path.name, re.I)]

@@ -295,8 +295,10 @@ def test_gaussians_are_shown_without_a_data_set(splats, tmp_path, generator):
     opened = open_model(str(tmp_path / "a.ply"), device="cpu")
     assert isinstance(opened, ExternalRun) and len(opened.method.model.splats) == len(broken) - 3
     assert opened.notes == ("3 Gaussians have values that are not finite or too large; they are left out",)
-    shown = padgs_command("render", tmp_path / "a.ply", *arguments[2:], "--to", tmp_path / "g")[1]
-    assert opened.notes[0] in shown
+    (tmp_path / "g").mkdir()
+    (tmp_path / "g" / "other.png").touch()
+    code, shown = padgs_command("render", tmp_path / "a.ply", *arguments[2:], "--to", tmp_path / "g")
+    assert code == 1 and opened.notes[0] in shown, "before the work, which fails here"
 
 
 def test_wrong_input_is_refused(run, splats, tmp_path):

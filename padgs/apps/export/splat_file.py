@@ -58,10 +58,10 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
         made = folder / f"made{path.name}"
         try:
             _convert(plain, made, *settings)
-            written = splats if path.suffix.lower() == ".html" else read_splats(made, scratch=folder)
+            written = None if path.suffix.lower() == ".html" else read_splats(made, scratch=folder)
         except ValueError as error:
             raise ValueError(f"{path} cannot be written ({error}); name another place, or write a .ply") from error
-        lost = "" if path.suffix.lower() == ".html" else _lost(splats, written, path)
+        lost = "" if written is None else _lost(splats, written, path)
         check_place(path)
         os.replace(made, path)
     return lost
