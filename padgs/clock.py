@@ -125,7 +125,7 @@ def machine(device: Device = "cpu") -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": torch.__version__,
         "cuda": torch.version.cuda if gpu else None,
-        "padgs": _package_version(),
+        "padgs": metadata.version("padgs"),
         "commit": commit(),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
@@ -151,10 +151,3 @@ def _linux(file: str, key: str) -> str:
     except OSError:
         return ""
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
-
-
-def _package_version() -> str | None:
-    try:
-        return metadata.version("padgs")
-    except metadata.PackageNotFoundError:
-        return None

@@ -37,7 +37,6 @@ REPORTS: Mapping[str, Report] = {
     "smallest_chart": Report("padgs.reports.smallest:charts", ("smallest",)),
     "chart": Report("padgs.reports.charts.trade_off_chart:charts", ("pareto", *QUALITY_ORDER, *ALL_METHODS)),
     "equal_time_chart": Report("padgs.reports.charts.trade_off_chart:equal_time_charts", ("equal_time",)),
-    "capacity_chart": Report("padgs.reports.charts.capacity_chart:charts", ("capacity",)),
     "gallery": Report("padgs.reports.charts.gallery:charts", ("equal_time", *QUALITY_ORDER, *ALL_METHODS)),
     "sweep": Report("padgs.reports.charts.sweep_chart:charts"),
     "findings": Report("padgs.reports.claims:findings"),

@@ -47,12 +47,6 @@ def path_length(poses: Tensor) -> float:
     return centers(poses).diff(dim=0).norm(dim=1).sum().item()
 
 
-def median_depth(poses: Tensor, points: Tensor) -> float:
-    """Return the median distance between cameras and points, in world units."""
-    some = points[:: max(1, len(points) // 20_000)].double()
-    return torch.cdist(centers(poses), some).median().item()
-
-
 def centers(poses: Tensor) -> Tensor:
     """Return the camera centres [F, 3] of poses [F, 4, 4]."""
     return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]

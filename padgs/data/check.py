@@ -12,7 +12,7 @@ from torch import Tensor
 import padgs.data
 from padgs.data import conventions
 from padgs.data.assemble import assemble
-from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
+from padgs.data.camera_paths import Gravity, centers, gravity, path_length
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Progress, listed, view_name
 from padgs.data.cloud import GREY_POINTS
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
@@ -93,7 +93,7 @@ def check(
     report.gravity = gravity(poses)
     ordered = sorted(used, key=lambda frame: frame.name)
     report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
-    report.median_depth = median_depth(poses, scene.points)
+    report.median_depth = scene.scale
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     if hidden := [f"{name} ({share:.1%})" for name, share in report.masked.items() if share > MAX_HIDDEN]:
         text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "

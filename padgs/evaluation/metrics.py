@@ -113,8 +113,6 @@ def sphere_weight(image: Tensor, mask: Tensor | None = None) -> Tensor:
 
 def band_rows(height: int, band: str, *, device: torch.device | str = "cpu") -> Tensor:
     """Return which rows of a panorama have their centre in a latitude band, [H] bool."""
-    if band not in BANDS:
-        raise ValueError(f"unknown latitude band {band!r}; known: {', '.join(BANDS)}")
     degrees = row_latitudes(height, dtype=torch.float64, device=device) * (180 / math.pi)
     return torch.stack([(degrees >= low) & (degrees < high) for low, high in BANDS[band]]).any(0)
 

@@ -29,7 +29,7 @@ SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-c
 STYLES = ("pannellum.css", "img-comparison-slider.css")
 IMAGE_WIDTH = 1024  # maximum pixels of an embedded panorama
 JPEG_QUALITY = 80
-CHARTS = ("equal_time_chart", "chart", "capacity_chart", "smallest_chart")  # of speed against accuracy
+CHARTS = ("equal_time_chart", "chart", "smallest_chart")  # of speed against accuracy
 MAX_VIEWS = 3  # per scene
 MAX_FILES = 90  # renders opened for a page; scenes that no longer fit are left out and named
 

@@ -19,7 +19,6 @@ from padgs.data.camera_paths import (
     gravity,
     interpolate_poses,
     look_along,
-    median_depth,
     path_length,
 )
 from padgs.data.capture import DataError
@@ -56,11 +55,10 @@ def test_tilted_cameras() -> None:
     assert found.tilt == pytest.approx(5)
 
 
-def test_path_length_and_median_depth() -> None:
+def test_path_length() -> None:
     poses = torch.stack([_pose(0.3, center) for center in ((0, 0, 0), (3, 4, 0), (3, 4, 2))])
     assert torch.allclose(centers(poses), torch.tensor([[0, 0, 0], [3, 4, 0], [3, 4, 2]], dtype=torch.float64))
     assert path_length(poses) == pytest.approx(7)
-    assert median_depth(poses[:1], torch.tensor([[1.0, 0, 0], [2, 0, 0], [0, 0, 9]])) == pytest.approx(2)
 
 
 def walk(places: list[list[float]]) -> Scene:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pytest
 from PIL import Image
-from support.made_up import budgets, compared, external, result, run_set, scored, small, swept, write
+from support.made_up import compared, external, result, run_set, scored, small, swept, write
 from typer.testing import CliRunner
 
 from padgs import results
@@ -134,7 +134,6 @@ EXACT = {"scores": scored(math.inf)}  # as of somebody who scores the photograph
     [
         ("chart", [external(25.0, "A & B"), external(26.0, "C")]),
         ("sweep", [replace(run, **EXACT) if run.seed else run for run in swept(scenes=["synthetic-room"], seeds=2)]),
-        ("capacity_chart", [replace(run, **EXACT) for run in budgets({("padgs", 100): 20.0, ("padgs", 200): 21.0})]),
         ("findings", [replace(run, **EXACT) if run.method == "padgs" else run for run in compared(seeds=2)]),
     ],
 )

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.capture import FARTHEST, DataError
+from padgs.gaussians import rotation_matrices
 
 REMEDY = "remove the image or compute its pose again"
 TOLERANCE = 1e-3  # of R R^T - I; accepts files with four digits, refuses scaled or sheared matrices
@@ -70,13 +71,7 @@ def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     length = _refuse_zeros(quaternion, where).norm().item()
     if abs(length - 1) > 0.01:
         raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1: divide it by that")
-    w, x, y, z = (quaternion if abs(length - 1) < 1e-12 else quaternion / length).tolist()
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)
+    return rotation_matrices(quaternion)
 
 
 def rotation_from_vector(vector: Tensor, where: str) -> Tensor:

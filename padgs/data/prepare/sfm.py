@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from padgs.data.capture import DataError, Progress
+from padgs.data.capture import Progress
 from padgs.data.formats.colmap_lens import pycolmap_module
 
 MAPPERS = ("incremental", "global")
@@ -25,12 +25,6 @@ LOSS_SCALE = 1.0  # pixels, of the Cauchy loss in the final refinement
 MAX_ERROR = 4.0  # pixels; points with larger reprojection errors are dropped, as in the mapper
 MIN_ANGLE = 1.5  # degrees between the rays to a point
 _PAIRS_PER_BATCH = 64  # of images
-
-
-def check_mapper(mapper: str) -> None:
-    """Refuse one of `MAPPERS` that the installed pycolmap does not have, by a DataError."""
-    if mapper == "global" and not hasattr(pycolmap := pycolmap_module(), "global_mapping"):
-        raise DataError(f"pycolmap {pycolmap.__version__} has no global mapper; update it, or leave out --mapper")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from padgs.data.capture import DataError
 from padgs.data.masks import mask_path
 from padgs.data.metres import KnownLength
 from padgs.data.prepare.pairs import PAIRS
-from padgs.data.prepare.sfm import MAPPERS, check_mapper
+from padgs.data.prepare.sfm import MAPPERS
 from padgs.data.prepare.sources import find_source, is_video
 
 PER_SECOND = 2.0
@@ -105,8 +105,7 @@ class Prepared:
 
 
 def check_options(source: Path, options: PrepareOptions) -> None:
-    """Refuse options that this kind of input, or the installed pycolmap, does not have, by a DataError."""
-    check_mapper(options.mapper)
+    """Refuse options that this kind of input does not have, by a DataError."""
     if not is_video(source):
         if options.per_second != PER_SECOND:
             raise DataError(f"--per-second {options.per_second:g}: {source} is no video; leave it out")

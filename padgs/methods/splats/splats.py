@@ -47,8 +47,6 @@ class Splats(nn.Module):
     ) -> None:
         """Build Gaussians without rotation: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3], one opacity."""
         super().__init__()
-        if not 0 <= degree <= harmonics.MAX_DEGREE:
-            raise ValueError(f"sh_degree is {degree}; it must be 0 to {harmonics.MAX_DEGREE}")
         count = len(means)
         self.degree, self.active_degree, self.scene_scale = degree, 0, scene_scale
         self.means = nn.Parameter(means.clone())
