@@ -134,7 +134,6 @@ def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
 PICTURES = "renders"  # folder of images: ground truth | render | error of each test view
-SMALLEST_PICTURE = "smallest.png"  # ground truth | full model | smallest model for each loss of `SMALLEST_PICTURED`
 
 
 def flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:

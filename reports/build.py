@@ -25,6 +25,7 @@ SEEN_NOTE = (
     "Tuned on: settings of methods were chosen on the scene; not tuned on: none was, but for the exceptions that the "
     "limitations name."
 )
+RANKS = "Rank: 1 + the number of rows in better places by {}, where all rows have 3 seeds; rows that tie share one."
 RATES = {"published": "published rates", "run": "rates for the run"}
 
 
@@ -87,7 +88,10 @@ class _Builder:
             notes.append(f"'paper': published numbers, from one RTX 3090 Ti{words}.")
         if any(place.seen for place in there):
             notes.append(SEEN_NOTE)
-        notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference]), *self.spec.notes]
+        notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference])]
+        if self.spec.by_rank and self._direction is not None:
+            notes.append(RANKS.format(self.measures[0].column.title))
+        notes += self.spec.notes
         return Table(self.name, self.spec.title, self.spec.corner, self._columns(), (*blocks, *single), tuple(notes))
 
     def _select(self, run_set: RunSet) -> DataFrame:
@@ -141,7 +145,7 @@ class _Builder:
         return f"padgs/{value}" if self.spec.rows == "variant" else methods.published_as(value)
 
     def _columns(self) -> tuple[Column, ...]:
-        found = [Column("rank", 0)] if self.spec.by_rank else []
+        found = [Column("rank", 0)] if self.spec.by_rank and self._direction is not None else []
         for measure in self.measures:
             ours = measure.column
             found.append(ours)
@@ -175,7 +179,7 @@ class _Builder:
                     if measure.difference:
                         row.append(_difference(cell, row[-1]) if comparable else Cell())
                 if self.spec.difference and measure.column.group == "PSNR":
-                    row.append(Cell(_by_seed(of[value], next(iter(of.values())), measure).value))
+                    row.append(Cell(_by_seed(of[value], next(iter(of.values())), measure).value, count=0))
             rows.append(Row(titles[value], tuple(row)))
         return tuple(rows)
 
@@ -226,17 +230,23 @@ class _Builder:
             heading = f"{measure.column.heading}, {published.TITLES[dataset]}"
             yield Block(heading, tuple(rows), own_columns=tuple(shown), across=across)
 
+    @property
+    def _direction(self) -> bool | None:
+        """Whether a higher first measure is better; None if neither end is best."""
+        return self.measures[0].column.higher_is_better
+
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
         """Return a row for each setting, the best first, those without a number last."""
         every = [(one.title, one_setting(one.runs, f"{where}, {one.title}")) for one in settings(runs)]
         found = [(title, over_seeds(own, self.measures)) for title, own in every]
-        sign = -1.0 if self.measures[0].column.higher_is_better else 1.0
+        sign = -1.0 if self._direction else 1.0
         found.sort(key=lambda row: (row[1][0].value is None, sign * (row[1][0].value or 0.0)))
         cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
         separable = not any(map(is_few, cells.values()))
         shared = places(cells, self.measures[0].column) if separable else []
-        ranks = {i: Cell(1 + sum(map(len, shared[:place]))) for place, rows in enumerate(shared) for i in rows}
-        return tuple(Row(title, (ranks.get(i, Cell()), *row)) for i, (title, row) in enumerate(found))
+        ranks = {i: Cell(1 + sum(map(len, shared[:place])), count=0) for place, rows in enumerate(shared) for i in rows}
+        first = [() if self._direction is None else (ranks.get(i, Cell()),) for i in range(len(found))]
+        return tuple(Row(title, (*rank, *row)) for rank, (title, row) in zip(first, found, strict=True))
 
     def _each_run(self, runs: DataFrame) -> Iterator[Row]:
         for one in settings(runs):
@@ -309,7 +319,7 @@ class _Pivot(_Builder):
 def _published(number: Published | None) -> Cell:
     if number is None or number.status == "missing":
         return Cell()
-    return Cell(number.value, status="" if number.status == "ok" else number.status)
+    return Cell(number.value, count=0, status="" if number.status == "ok" else number.status)
 
 
 def _by_seed(ours: DataFrame, theirs: DataFrame, measure: Measure) -> Cell:
@@ -319,4 +329,4 @@ def _by_seed(ours: DataFrame, theirs: DataFrame, measure: Measure) -> Cell:
 
 
 def _difference(ours: Cell, theirs: Cell) -> Cell:
-    return Cell() if ours.value is None or theirs.value is None else Cell(ours.value - theirs.value)
+    return Cell() if ours.value is None or theirs.value is None else Cell(ours.value - theirs.value, count=0)

@@ -154,8 +154,13 @@ def decides(key: str) -> bool:
 
 
 def values_of(result: Result) -> dict[str, Any]:
-    """Return dotted key -> value of the configuration, also of options that are newer than the run."""
+    """Return dotted key -> value of the configuration, also of options that are newer than the run.
+
+    Without those of the generator for data from files, which ignore them.
+    """
     found = dict(flat(result.config))
+    if found.get("data.path") and found.get("data.format") != "synthetic":
+        found = {key: value for key, value in found.items() if not key.startswith("data.generator.")}
     return found | BEFORE | found
 
 
@@ -201,16 +206,21 @@ def _rules(result: Result) -> Iterator[tuple[str, str]]:
 
 
 def _length(result: Result) -> str:
+    """Return the length of training and the limits of the model in words."""
     budget = result.config.get("budget", {})
-    if "seconds" not in budget:
-        return f"{result.iterations} iterations"
-    return f"{budget['seconds']:g} s{' of CPU time' if budget['clock'] == 'cpu' else ''}"
+    words = [f"{result.iterations} iterations"]
+    if "seconds" in budget:
+        words = [f"{budget['seconds']:g} s{' of CPU time' if budget['clock'] == 'cpu' else ''}"]
+    if count := budget.get("gaussians"):
+        words.append("Gaussians as needed" if count == "auto" else f"at most {count:,} Gaussians".replace(",", " "))
+    return ", ".join([*words, *(["until nothing is gained"] if budget.get("stop") == "auto" else [])])
 
 
 def _learning_rates(result: Result) -> Any:
     """Return `train.learning_rates` where it has an effect; None for methods without the choice."""
     choice = result.config.get("train", {}).get("learning_rates", "published")
-    if result.method == "egonerf" or not result.iterations:  # a run of seconds may fail before its first iteration
+    is_trained = result.iterations and not result.external  # a run of seconds may fail before its first iteration
+    if result.method == "egonerf" or not is_trained:
         return None
     timed = "seconds" in result.config.get("budget", {})  # seeds differ in iterations, and not in the choice
     return "published" if choice == 1 or (choice == "run" and not timed and law(result.iterations) == 1) else choice
@@ -218,7 +228,7 @@ def _learning_rates(result: Result) -> Any:
 
 def _factor(result: Result) -> float | None:
     choice = result.config.get("train", {}).get("learning_rates", "published")
-    if not result.iterations:
+    if result.external or not result.iterations:
         return None
     return 1.0 if choice == "published" else law(result.iterations, result.method) if choice == "run" else float(choice)
 

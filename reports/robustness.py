@@ -172,7 +172,7 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
     blocks = []
     for title, those in found.items():
         row = partial(_row, presets, those)
-        scores = [row(of.replace("_", " "), lambda one, of=of: Cell(getattr(one, of))) for of in SCORES]
+        scores = [row(of.replace("_", " "), lambda one, of=of: Cell(getattr(one, of), count=0)) for of in SCORES]
         rows = [row(f"unstressed: {of}", partial(_unstressed, columns)) for of, columns in UNSTRESSED.items()]
         known = [made for made in rows if any(cell.value is not None for cell in made.cells)]
         kept = [row(f"{of[0]} {of[1]}", lambda one, of=of: one.robustness.get(of, Cell())) for of in all_stress(those)]
@@ -203,7 +203,7 @@ def limits(run_set: RunSet) -> Table:
             allowed = levels[level - 1] if level <= len(levels) else None
             words = f"{condition} {level}, {UNITS[metric]}"
             lost = row(words, partial(_lost, (condition, level), metric, allowed))
-            rows.append(Row(words, (Cell(allowed), *lost.cells)))
+            rows.append(Row(words, (Cell(allowed, count=0), *lost.cells)))
         blocks.append(Block(title, tuple(rows)))
     columns = (Column("allowed", 2), *(Column(methods.title(preset), 2) for preset in presets))
     notes = (*_footnotes(run_set, found), *LIMITS_NOTES)

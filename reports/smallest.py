@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +12,12 @@ from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, 
 from padgs.reports.conditions import OF_TIMES, footnotes, sheets
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import mean_cell
-from padgs.reports.store import split_image
 from padgs.reports.table import Block, Column, Row, Table
-from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, SMALLEST_STATED
+from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURED, SMALLEST_STATED
 
 STATED = f"{SMALLEST_STATED:g}"  # dB, as results name losses
 PANELS = (("blended", "Gaussians blended", 1), ("bytes", "model, MB", 1e-6), ("frame_ms", "minimal ms per frame", 1))
 LOSSES = tuple(f"{loss:g}" for loss in SMALLEST_PICTURED)  # dB, marked in the chart by a ring and a square
-IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic
 NOTES = (
     "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
@@ -41,7 +38,6 @@ class Curve:
     method: str  # the same without the seed
     preset: str
     found: Mapping[str, Any]  # `Result.smallest`
-    image: Path | None = None  # see `padgs.results.SMALLEST_PICTURE`
 
     @property
     def steps(self) -> list[Mapping[str, Any]]:
@@ -78,8 +74,7 @@ def curves(runs: DataFrame) -> list[Curve]:
         several = runs.loc[runs["preset"] == setting.preset, "seed"].nunique() > 1
         for run in one_setting(setting.runs, setting.title).to_dict("records"):
             title = setting.title + (f", seed {run['seed']}" if several else "")
-            image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
-            found.append(Curve(title, setting.title, setting.preset, run["smallest"], image))
+            found.append(Curve(title, setting.title, setting.preset, run["smallest"]))
     return found
 
 
@@ -126,16 +121,11 @@ def table(run_set: RunSet) -> Table:
 
 
 def charts(run_set: RunSet) -> list[Chart]:
-    """Return a chart for each scene that was searched, and one of test views if there are renders."""
+    """Return a chart for each scene that was searched."""
     found = []
     for name, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
-        if rendered := [curve for curve in curves(own) if curve.image is not None and curve.image.is_file()]:
-            try:
-                found.append(_renders(f"{name}_renders", title, rendered, notes))
-            except OSError as error:
-                run_set.warnings.append(f"a picture is left out: {error}")
     return found
 
 
@@ -159,25 +149,6 @@ def _chart(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) ->
     what = f"{title}\nsmaller models of the same run; {marks}"
     lay_out(made, what)
     return Chart(name, what, made, notes, _numbers(name, found))
-
-
-@styled
-def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) -> Chart:
-    """Return a test view of each run: ground truth, the whole model, and the smallest models for two losses."""
-    made, axes = figure(4, len(found), 3.6, 2.2)
-    for row, curve in zip(axes, found, strict=True):
-        assert curve.image is not None, "chosen by it"
-        steps = [curve.found["steps"][0], *(curve.smallest[loss] for loss in LOSSES)]
-        words = [curve.title, f"all: {steps[0]['blended']} Gaussians"]
-        words += [f"{loss} dB: {step['blended']}" for loss, step in zip(LOSSES, steps[1:], strict=True)]
-        for panel, part, text in zip(row, split_image(curve.image, 4), words, strict=True):
-            part.thumbnail((IMAGE_WIDTH, IMAGE_WIDTH))
-            panel.imshow(part)
-            panel.set_title(text)
-            panel.set_axis_off()
-    what = f"{title}\na test view: ground truth, whole model, and the smallest that lose {' and '.join(LOSSES)} dB"
-    lay_out(made, what)
-    return Chart(name, what, made, notes)
 
 
 def _draw(panel: Any, curve: Curve, quantity: str, unit: float, color: str, *, first: bool) -> None:

@@ -87,8 +87,7 @@ def _with_budget(runs: DataFrame) -> DataFrame:
     """Keep runs with a number of Gaussians, not auto or null, the fewest first."""
     if runs.empty:
         return runs
-    runs = runs.loc[runs[BUDGET].map(lambda count: is_number(count) and count > 0)].sort_values(BUDGET, kind="stable")
-    return runs.assign(budget=[f"at most {count:,} Gaussians".replace(",", " ") for count in runs[BUDGET]])
+    return runs.loc[runs[BUDGET].map(lambda count: is_number(count) and count > 0)].sort_values(BUDGET, kind="stable")
 
 
 def _with_rates(runs: DataFrame) -> DataFrame:

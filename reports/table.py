@@ -39,14 +39,14 @@ class Cell:
 
     value: float | None = None
     std: float | None = None  # None for a single run
-    count: int = 1  # of seeds
+    count: int = 1  # of seeds; 0: of no runs of ours, as limits, ranks and published numbers
     status: str = ""  # of failed runs: oom, nan, ...
     ranked: bool = True  # False: shown, but never highlighted
 
     @property
     def numbers(self) -> dict[str, Any]:
         """Fields of a line of a CSV file."""
-        count = None if self.value is None else self.count
+        count = None if self.value is None else self.count or None
         return {"value": self.value, "std": self.std, "n": count, "status": self.status}
 
     def text(self, column: Column, *, counted: bool = True) -> str:
@@ -58,8 +58,8 @@ class Cell:
         if self.value is None:
             return self.status.upper() or MISSING
         text = format_number(self.value, column)
-        if self.std is not None:
-            text += f" ± {self.std:.{column.decimals}f}" + (f" (n={self.count})" if counted else "")
+        text += "" if self.std is None else f" ± {self.std:.{column.decimals}f}"
+        text += f" (n={self.count})" if counted and self.count else ""
         return text + (f" [{self.status.upper()}]" if self.status else "")
 
 
@@ -72,16 +72,16 @@ class Row:
     signed: bool = False  # differences
 
     def texts(self, columns: Sequence[Column]) -> list[str]:
-        """Return title and cells as text; a number of seeds that all cells share moves to the title.
+        """Return title and cells as text; a number of seeds that all cells share moves to the title, if it is not one.
 
         >>> Row("PaD-GS", (Cell(26.018, 0.04, 5), Cell(0.8, 0.01, 5))).texts([Column("PSNR", 2), Column("SSIM", 3)])
         ['PaD-GS (n=5)', '26.02 ± 0.04', '0.800 ± 0.010']
         """
-        counts = {cell.count for cell in self.cells if cell.std is not None}
         known = [cell for cell in self.cells if cell.value is not None]
+        counts = {cell.count for cell in known if cell.count}
         unranked = bool(known) and not any(cell.ranked for cell in known)
         title = f"{self.title} {UNRANKED}" if unranked else self.title
-        title += f" (n={min(counts)})" if len(counts) == 1 else ""
+        title += f" (n={min(counts)})" if len(counts) == 1 and counts != {1} else ""
         columns = [replace(column, signed=True) for column in columns] if self.signed else columns
         texts = (cell.text(column, counted=len(counts) > 1) for cell, column in zip(self.cells, columns, strict=True))
         marks = ("" if unranked or cell.ranked else f" {UNRANKED}" for cell in self.cells)

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Format, Images, Mask, Split, check_range, name_place, show
+from padgs.cli.errors import Depth, Format, Images, Mask, Points, Split, check_range, name_place, show
 
 
 def split(
@@ -14,6 +14,8 @@ def split(
     format: Format = "auto",
     mask: Mask = "auto",
     images: Images = "",
+    points: Points = "auto",
+    depth: Depth = "auto",
     split: Split = "auto",
 ) -> None:
     """Divide a data set into blocks of cameras that see the same points; their images are links to those of SOURCE."""
@@ -26,9 +28,11 @@ def split(
 
     check_range(2, 10_000, blocks=blocks)
     destination = Path(to or f"{os.path.abspath(source)}-blocks")  # also of "."
-    options = DataOptions(mask=mask, split=split, images=images or None)
+    options = DataOptions(mask=mask, split=split, images=images or None, points=points, depth=depth)
     with name_place(destination):
-        written = write(Path(source), destination, blocks, format, options)
+        written, notes = write(Path(source), destination, blocks, format, options)
+    for note in notes:
+        show(f"  {note}")
     for folder, content in written.items():
         show(f"{folder}: {content}")
     names = ",".join(f'"{folder}"' if "," in folder else folder for folder in map(str, written))

@@ -1,9 +1,10 @@
 """Parts of all commands: errors as one line, text for the terminal, arguments that name a run."""
 
 import os
+import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import wraps
 from inspect import signature
@@ -34,6 +35,7 @@ Points = Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 fi
 Images = Annotated[str, typer.Option(help="image folder, if not the usual one")]
 Cameras = Annotated[str, typer.Option(help="all, or panoramas: leave out images of other cameras")]
 Split = Annotated[str, typer.Option(help="how to choose held-out views: auto, files, every or all (none held out)")]
+OF_DATA = ("mask", "points", "images", "split", "depth", "cameras", "format")  # keys of `data`, and options
 MAX_SEED, MAX_THREADS = 2**32 - 1, max(64, 4 * (os.cpu_count() or 1))
 
 
@@ -55,7 +57,7 @@ def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
         except (typer.Exit, BrokenPipeError):  # typer ends in silence where the reader of the output has ended
             raise
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            show(f"error: {_message(error, **options)}", sys.stderr)
+            show(f"error: {_as_options(_message(error, **options), options)}", sys.stderr)
             raise typer.Exit(1) from error
 
     return wrapped
@@ -81,6 +83,16 @@ def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) 
         runs = " or ".join(given)
         return f"{error}; it is the data of {runs}: if it has moved, name its place with --data"
     return str(error) or "out of memory"
+
+
+def _as_options(message: str, options: Mapping[str, Any]) -> str:
+    """Return a message with the options of a command instead of the keys of a run that mean the same.
+
+    >>> _as_options("set data.mask=inverted, or data.width=512", {"mask": "auto"})
+    'set --mask inverted, or data.width=512'
+    """
+    known = "|".join(name for name in OF_DATA if name in options) or "(?!)"
+    return re.sub(rf"data\.({known})\b(=?)", lambda found: f"--{found[1]}{' ' * bool(found[2])}", message)
 
 
 def check_range(low: float, high: float, **options: float | None) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from padgs.checks import lookup
 from padgs.data.assemble import assemble, found_images
-from padgs.data.capture import OTHERS, Capture, DataError, DataOptions
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, given_path
 from padgs.data.cloud import NO_FILE, read_cloud
 from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
@@ -96,6 +96,6 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
             own = best_reading(found_images(reader(path, replace(options, points="auto"))))
             capture = replace(capture, frames=own.frames, notes=(*notes, *own.notes), readings=())
     if options.points not in NO_FILE:  # before its frame is chosen; tracks belong to the capture's own points
-        cloud, notes = read_cloud(capture.folder / options.points)
+        cloud, notes = read_cloud(given_path(options.points, capture.folder))
         capture = replace(capture, cloud=cloud, tracks=None, notes=(*capture.notes, *notes))
     return best_reading(found_images(capture))

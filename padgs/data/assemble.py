@@ -13,7 +13,18 @@ import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed, view_name
+from padgs.data.capture import (
+    OTHERS,
+    Capture,
+    DataError,
+    DataOptions,
+    Frame,
+    UnknownLens,
+    first_of,
+    given_path,
+    listed,
+    view_name,
+)
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
@@ -25,7 +36,7 @@ from padgs.files import file_name
 from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
-MAX_GAP = 1e4  # between cameras and points, times the median distances within both
+MAX_GAP = 100  # between cameras and points, times the median distances within both
 MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 HIDDEN = (".", "__MACOSX", "@eaDir", "@Recycle", "#recycle")  # beginnings of names; network drives keep previews there
@@ -161,9 +172,9 @@ def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]
 def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_FOLDERS) -> Path:
     """Return the given folder (a DataError if missing), else the first usual one that exists, else that of the data."""
     if given is not None:
-        if not (folder / given).is_dir():
-            raise DataError(f"data.images={given}: there is no folder {folder / given}")
-        return folder / given
+        if not (found := given_path(given, folder)).is_dir():
+            raise DataError(f"data.images={given}: there is no folder {found}; name it from {folder} or from here")
+        return found
     return first_of(folder, usual, Path.is_dir) or folder
 
 
@@ -212,13 +223,18 @@ def found_images(capture: Capture) -> Capture:
     if folder == capture.folder and not there:
         folder = image_folder(folder, None)
     meant: dict[str, set[str]] = {}
+    ends: dict[str, set[str]] = {}  # end of a file's path, with and without extension -> files
     for file in image_names(folder):
         whole, *without = spellings(file)
         for key in (whole, *without[:1]):
             meant.setdefault(key.casefold(), set()).add(file)
+        for key in without:
+            ends.setdefault(key.casefold(), set()).add(file)
     found = {}  # stated name -> file
     for name in (frame.name for frame in capture.frames if frame.name not in there):
         files = next((meant[key] for key in spellings(name.casefold()) if key in meant), set())
+        if not files and not there:  # labels of a program that does not state the folders of its photographs
+            files = next((ends[key] for key in [*spellings(name.casefold())][:2] if key in ends), set())
         if len(files) > 1:
             way_out = "remove all but one, set data.images to its folder, or name it with folder and extension"
             raise DataError(f"{name!r} of the {capture.format} data set may be {listed(sorted(files))}; {way_out}")
@@ -267,8 +283,8 @@ def _refuse_missing(capture: Capture) -> None:
         return
     unreadable = next((name for name in image_names(capture.image_folder) if name in absent), None)
     remedy = "set data.images to the folder that holds them, or name the others in train.txt and test.txt"
-    last_names = {PurePosixPath(name).name for name in absent}
-    elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).name in last_names), None)
+    last_names = {PurePosixPath(name).stem for name in absent}
+    elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).stem in last_names), None)
     above = [image_folder(folder, None) for folder in list(capture.folder.absolute().parents)[:3]]
     if outside := next((folder for folder in above if (folder / absent[0]).is_file()), None):
         remedy = f"set data.images to {os.path.relpath(outside, capture.folder)}, which holds {absent[0]}"
@@ -281,8 +297,8 @@ def _refuse_missing(capture: Capture) -> None:
 
 
 def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[str]:
-    """Check that all panoramas have the size of their camera, or differ from it by one common factor."""
-    scales: dict[float, str] = {}
+    """Check that all panoramas of a camera have its size, or differ from it by one common factor."""
+    scales: dict[tuple[int, int], dict[float, str]] = {}  # stated size -> factor -> sizes in words
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
             continue
@@ -294,11 +310,12 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
         if frame.width != 2 * frame.height or frame.width < 1:
             rule = "a full panorama is 2:1: correct its size"
             raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; {rule}")
-        scales.setdefault(image.width / frame.width, text)
-    if len(scales) > 1:
-        differ = "; but ".join(list(scales.values())[:2])
-        raise DataError(f"images and cameras disagree in size: {differ}; make them agree")
-    return [f"images: {text}; used as they are" for scale, text in scales.items() if scale != 1]
+        scales.setdefault((frame.width, frame.height), {}).setdefault(image.width / frame.width, text)
+    for of_camera in scales.values():
+        if len(of_camera) > 1:
+            differ = "; but ".join(list(of_camera.values())[:2])
+            raise DataError(f"images and cameras disagree in size: {differ}; make them agree")
+    return [f"images: {text}; used as they are" for of in scales.values() for scale, text in of.items() if scale != 1]
 
 
 def _view_size(image: ImageFile, width: int | None) -> tuple[int, int]:

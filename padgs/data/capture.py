@@ -21,6 +21,7 @@ from padgs.checks import unknown
 from padgs.geometry.camera import Camera
 
 Progress = Callable[[int, int], None]  # called with (done, total)
+EVERY = 8  # of so many views one is a test view, where no list says which
 FARTHEST = 1e15  # world units from the origin, the limit of renderers (`padgs.render.contract`)
 OTHERS = "also present, not used"  # words of a note about files of other formats
 
@@ -43,6 +44,14 @@ def listed(names: Iterable[object], most: int = 5) -> str:
 def folded(path: Path | PurePosixPath | str) -> str:
     """Return a path as it is compared: without case, in one Unicode form."""
     return normalize("NFC", PurePosixPath(path).as_posix()).casefold()
+
+
+def given_path(given: str, folder: Path) -> Path:
+    """Return the path that an option names: from the data set's folder or, where nothing is there, from the working
+    directory.
+    """
+    inside, here = folder / given, Path(given).absolute()
+    return here if here.exists() and not inside.exists() else inside
 
 
 def by_id(pairs: Iterable[tuple[Any, Any]], where: str) -> dict[Any, Any]:
@@ -195,7 +204,7 @@ class DataSettings:
     depth: str = "auto"  # auto: depth maps that the format names, or in depths/ with depth.json | none
     cameras: str = "all"  # all | panoramas: leave out photographs of other cameras
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
-    test_every: int = 8  # k of split=every
+    test_every: int = EVERY  # k of split=every, and of auto without lists
     cache_bytes: int = 1 << 30  # memory for decoded images of all views
     disk_cache: str = "auto"  # auto: keep decoded images on disk if they exceed cache_bytes | off | a folder
     prefetch_threads: int = 2  # threads that decode images in advance; 0 = none

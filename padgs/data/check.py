@@ -97,7 +97,7 @@ def check(
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     if hidden := [f"{name} ({share:.1%})" for name, share in report.masked.items() if share > MAX_HIDDEN]:
         text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "
-        text += "255 means use, 0 means ignore: repair them, or set data.mask (--mask) to none, inverted or a folder"
+        text += "255 means use, 0 means ignore: repair them, or set data.mask to none, inverted or a folder"
         (report.problems if options.mask == "auto" else report.notes).append(text)
     _check_leaks(scene, digests, report)
     if report.path_length == 0 and len(poses) > 1:

@@ -14,7 +14,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture, DataError, first_of, folded, listed
+from padgs.data.capture import Capture, DataError, first_of, folded, given_path, listed
 from padgs.data.image_metadata import Crop
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
@@ -83,7 +83,9 @@ def find_masks(
     inverted, given = spec == "inverted" or spec.startswith("inverted:"), spec
     spec = (spec.removeprefix("inverted").removeprefix(":") or "auto") if inverted else spec
     rule = _ROWS.fullmatch(spec)
-    files, note = ({}, None) if spec == "none" else _mask_files(capture, mask_path(spec, capture.folder))
+    stated = capture.folder / spec if given == capture.mask else None  # by the data set, so in its folder
+    path = stated if stated is not None and stated.exists() else mask_path(spec, capture.folder)
+    files, note = ({}, None) if spec == "none" else _mask_files(capture, path)
     if inverted and not files:
         raise DataError(f"data.mask={given}: there are no mask files to invert; put some in {capture.folder / 'masks'}")
     notes = [note] if note else []
@@ -140,12 +142,10 @@ def mask_path(spec: str, folder: Path) -> Path | None:
     """
     if spec in ("auto", "none", "inverted") or _ROWS.fullmatch(spec):
         return None
-    inside, given = folder / spec, Path(spec).absolute()
-    if not given.exists():
-        return inside
-    if inside.exists() and not inside.samefile(given):
-        raise DataError(f"data.mask={spec} is both {inside} and {given}; give the absolute path of one")
-    return given
+    inside, here = folder / spec, Path(spec).absolute()
+    if here.exists() and inside.exists() and not inside.samefile(here):
+        raise DataError(f"data.mask={spec} is both {inside} and {here}; give the absolute path of one")
+    return given_path(spec, folder)
 
 
 def _refuse_hidden(weights: Tensor, what: str, way_out: str) -> float:

@@ -51,7 +51,7 @@ def _check_header(path: Path) -> None:
 def _readable(path: Path, again: str) -> Iterator[None]:
     refuse_special(path)
     if not path.exists():
-        raise DataError(f"the point cloud {path} does not exist")
+        raise DataError(f"the point cloud {path} does not exist; name it from the data set's folder or from here")
     try:
         yield
     except BaseException as error:  # both packages raise what their libraries raise, and decoders in Rust panic

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from unicodedata import normalize
 
-from padgs.data.capture import DataError, first_of, listed
+from padgs.data.capture import EVERY, DataError, first_of, listed
 from padgs.data.images import EXTENSIONS, read_bytes
 
 MAX_NAME_BYTES = 255  # of a file name
@@ -29,7 +29,7 @@ def split_frames(
     folder: Path,
     *,
     mode: str = "auto",
-    every: int = 8,
+    every: int = EVERY,
     stated: Mapping[str, tuple[str, ...]] | None = None,
     unposed: Names = (),
     left_out: Names = (),
@@ -43,6 +43,7 @@ def split_frames(
     lists overlap, or that a side is empty.
     """
     if mode == "all":
+        _refuse_every(every, "data.split=all")
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
     places = (folder, folder / "sparse" / "0")  # the second as in the released 3DGS
     found = {side: [file for place in places if (file := first_of(place, (name,)))] for side, name in LISTS.items()}
@@ -60,6 +61,7 @@ def split_frames(
         if mode == "files":
             raise DataError(f"data.split=files, but {folder} holds no train.txt, no test.txt; write them or use every")
         return _every(names, every, mode)
+    _refuse_every(every, origin.partition(";")[0])
     chosen = {side: _resolve(lines, names, which[side], unposed, left_out) for side, lines in lists.items()}
     notes = [f"split: {origin}"]
     for side, other in (("train", "test"), ("test", "train")):
@@ -76,6 +78,13 @@ def split_frames(
     if unused := len(names) - len(chosen["train"]) - len(chosen["test"]):
         notes.append(f"{unused} posed views are in neither list and are not used")
     return Split(tuple(sorted(chosen["train"])), tuple(sorted(chosen["test"])), tuple(notes))
+
+
+def _refuse_every(every: int, decides: str) -> None:
+    if every != EVERY:
+        raise DataError(
+            f"data.test_every={every} changes nothing, because {decides} decides; leave it out, or set data.split=every"
+        )
 
 
 def read_list(path: Path) -> tuple[str, ...]:

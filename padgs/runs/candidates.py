@@ -74,7 +74,7 @@ def deciding_views(scene: Scene) -> tuple[View, ...]:
     if len(scene.test) < MIN_VIEWS:
         raise ValueError(
             f"{len(scene.test)} test views are too few for the search for the smallest model, which compares at least "
-            f"{MIN_VIEWS} that no model was trained on; hold out more, e.g. every fourth by data.test_every=4"
+            f"{MIN_VIEWS} not trained on; hold out more, every fourth by data.split=every data.test_every=4"
         )
     return scene.test
 

@@ -80,7 +80,7 @@ def run(
     result = store.result()
     if (
         result is not None
-        and not (_is_retried(config, result) or _unscored(config, scene, result))
+        and not (_is_retried(config, result) or _unscored(config, scene, result, can_score=store.has_checkpoint))
         and results.joined(result.experiments, config.labels.experiments) == result.experiments
     ):
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
@@ -305,11 +305,14 @@ def _is_retried(config: RunConfig, result: Result) -> bool:
     return result.status in RETRIED and config.retry == "failed"
 
 
-def _unscored(config: RunConfig, scene: Scene, result: Result) -> dict[str, Protocol]:
-    """Return the protocols under whose rules a run that did not fail has no scores of its test views, if any."""
+def _unscored(config: RunConfig, scene: Scene, result: Result, *, can_score: bool) -> dict[str, Protocol]:
+    """Return the protocols under whose rules a run that did not fail has no scores of its test views, if any.
+
+    LPIPS whose weights have come since is missing only where a checkpoint is left to score (`can_score`).
+    """
     asked = config.protocols.items() if result.status not in RETRIED and scene.test else ()
     known = {name: scores.protocol for name, scores in result.scores.items()}
-    late = {name for name, of in result.scores.items() if NO_WEIGHTS in "".join(of.notes)}
+    late = {name for name, of in result.scores.items() if can_score and NO_WEIGHTS in "".join(of.notes)}
     return {
         name: rules
         for name, rules in asked
@@ -349,7 +352,7 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
             store.forget(result)
         return None
     complete = replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
-    if unscored := _unscored(config, scene, result):
+    if unscored := _unscored(config, scene, result, can_score=store.has_checkpoint):
         _refuse_other_rules(store, result, unscored)
         say(console, "finished before; only scores are missing")
         if not store.has_checkpoint:  # an untrained method would be scored

@@ -16,12 +16,8 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import cycle, islice
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from PIL import Image
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Column, Table
@@ -29,10 +25,9 @@ from rich.table import Column, Table
 from padgs import results
 from padgs.clock import Lap, timed
 from padgs.evaluation.evaluate import evaluate
-from padgs.evaluation.images import to_uint8
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.methods.splats.importance import importance_scores
-from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_PICTURED, Result
+from padgs.results import SMALLEST_LOSSES, Result
 from padgs.runs import candidates
 from padgs.runs.config import BudgetOptions, RunConfig
 from padgs.runs.console import MISSING, number, say
@@ -114,7 +109,6 @@ class Search:
         config = replace(config, variant=variant, labels=labels, protocols=self.run.config.protocols)
         options = replace(config.run, pictures=self.run.config.run.pictures)
         kept = self._trained(replace(config, run=options), self._stop_requested)
-        self._save_picture(self.run.folder / SMALLEST_PICTURE)
         found = self.front() | {"kept": {"epsilon": epsilon, "run": kept.run}}
         result = self.run.files.result() or self._result  # other commands may have added experiments or scores
         served = results.joined(result.experiments, (EXPERIMENT,))
@@ -185,15 +179,6 @@ class Search:
             failed = f"{config.run.folder}/{result.run} ended with status {result.status} ({result.reason})"
             raise ValueError(f"{failed}; padgs smallest {self.run.folder} tries it again")
         return result
-
-    @torch.no_grad()
-    def _save_picture(self, path: Path) -> None:
-        """Save the middle test view: ground truth, the render of RUN, those of the smallest models for two losses."""
-        view = self.run.scene.test[len(self.run.scene.test) // 2]
-        runs = (candidates.smallest(self.candidates, epsilon, self.shares).run for epsilon in SMALLEST_PICTURED)
-        methods = (self.run.method, *(self._load(self.run.folder / FOLDER / run).method for run in runs))
-        images = [view.image(), *(method.render(view).image for method in methods)]
-        Image.fromarray(np.concatenate([to_uint8(image) for image in images], axis=1)).save(path)
 
 
 def find_smallest(

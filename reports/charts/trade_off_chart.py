@@ -8,6 +8,7 @@ from textwrap import wrap
 from typing import Any
 
 import numpy as np
+from pandas import DataFrame, Series
 
 from padgs.reports import methods
 from padgs.reports.charts import drawing
@@ -135,7 +136,10 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     ends = [(seconds[-1], psnr[-1], END_RADIUS) for _, seconds, psnr in curves]
     write_labels(panel, labels, [*ends, *_along(panel)])
     lost = "; ".join(sorted({point.title for point in trade_off.points} - {setting.title for setting, _, _ in curves}))
-    notes = [f"Without logs of one length in all scenes, so without a line: {lost}."] if lost else []
+    notes = [f"Without logs in all scenes, so without a line: {lost}."] if lost else []
+    own = [setting.runs for setting, _, _ in curves]
+    if absent := [run for runs in own for run in runs.loc[~_has_log(runs), "run"]]:
+        notes.append(f"Without a complete log, so in no line: {', '.join(absent)}.")
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, (*trade_off.notes, *notes))
 
 
@@ -163,22 +167,31 @@ def _named(trade_off: TradeOff, curves: Sequence[Any], low: float, high: float) 
 def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]]]:
     """Return seconds and PSNR of each setting, evaluation by evaluation: means over scenes, of means over seeds.
 
-    Runs without a complete log are left out, and settings without a run in a scene. Logs have wall time, which is
-    scaled so that it ends with the run's CPU time where that is known.
+    Runs of a time differ in iterations, so both are interpolated at equal shares of the iterations done. Runs without a
+    complete log are left out, and settings without a run in a scene. Logs have wall time, which is scaled so that it
+    ends with the run's CPU time where that is known.
     """
     found = []
     for setting in settings(trade_off.runs.loc[trade_off.runs["ok"]]):
-        scales = (setting.runs["train_seconds"] / setting.runs["wall_seconds"]).fillna(1.0)
-        logs = [*zip(setting.runs["place"], setting.runs["log"], scales, strict=True)]
-        count = max(len(log["psnr"]) for _, log, _ in logs)  # others would cut the mean
+        runs = setting.runs.loc[_has_log(setting.runs)]
         of_scenes: dict[Any, list[Any]] = {place: [] for place in trade_off.runs["place"].unique()}
-        for place, log, scale in logs:
-            if len(log["psnr"]) == count:
-                of_scenes[place].append((scale * np.array(log["seconds"]), log["psnr"]))
-        if count and all(of_scenes.values()):
+        shares = [np.array(log["iteration"]) / log["iteration"][-1] for log in runs["log"]]
+        grid = max(shares, key=len, default=np.zeros(0))
+        grid = grid[grid >= max((share[0] for share in shares), default=0)]
+        scales = (runs["train_seconds"] / runs["wall_seconds"]).fillna(1.0)
+        for place, log, share, scale in zip(runs["place"], runs["log"], shares, scales, strict=True):
+            seconds = np.interp(grid, share, scale * np.array(log["seconds"]))
+            of_scenes[place].append((seconds, np.interp(grid, share, log["psnr"])))
+        if all(of_scenes.values()):
             seconds, psnr = np.mean([np.mean(of, axis=0) for of in of_scenes.values()], axis=0).tolist()
             found.append((setting, *without_dips(seconds, psnr)))
     return found
+
+
+def _has_log(runs: DataFrame) -> Series:
+    """Return which runs have a log that reaches their last iteration."""
+    ends = [log["iteration"][-1] if log["iteration"] else math.nan for log in runs["log"]]
+    return runs["iterations_done"] == ends
 
 
 def without_dips(seconds: Sequence[float], psnr: Sequence[float]) -> tuple[list[float], list[float]]:
@@ -263,6 +276,7 @@ def _conditions(trade_off: TradeOff) -> str:
     """Return the conditions that all runs share, so that the image can be read alone."""
     known = (trade_off.runs[column].unique() for column in ("resolution", "length"))  # no length of external models
     shared = [values[0] for values in known if len(values) == 1 and values[0]]
-    seeds = trade_off.runs["seed"].nunique()
-    bars = [f"bars: standard deviation over {seeds} seeds"] if seeds > 1 else []
+    counts = {cell.count for point in trade_off.points for cell in point.numbers.values() if cell.std is not None}
+    seeds = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else ""
+    bars = [f"bars: standard deviation over {seeds} seeds"] if seeds else []
     return ", ".join(["up and to the left is better", *shared, *bars])

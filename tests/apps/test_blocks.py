@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 import padgs.data
 from padgs import results
-from padgs.apps import blocks
-from padgs.apps.blocks import BLOCK, REGIONS, bisect, merge
+from padgs.apps import block_plan, blocks
+from padgs.apps.block_plan import bisect
+from padgs.apps.blocks import BLOCK, REGIONS, merge
 from padgs.cli.commands import app
 from padgs.data.assemble import assemble
 from padgs.data.capture import Capture, Cloud, DataOptions, Frame, Tracks
@@ -94,27 +95,30 @@ def test_tracks_say_what_a_camera_sees():
     tracks = Tracks(torch.tensor([0, 1, 1]), torch.tensor([2, 0, 1]), torch.zeros(3, 2))
     capture = Capture("colmap", Path(), Path(), frames, None, tracks=lambda: tracks)
     views = [View(name, torch.eye(4), 8, 4) for name in "ba"]
-    assert blocks.visibility(capture, views, torch.zeros(3, 3)).tolist() == [[True, True, False], [False, False, True]]
+    assert block_plan.visibility(capture, views, torch.zeros(3, 3)).tolist() == [
+        [True, True, False],
+        [False, False, True],
+    ]
 
 
 def test_a_block_is_a_room_with_the_views_that_see_into_it(source, parts):
     whole, loaded = padgs.data.load(source), [padgs.data.load(part) for part in parts]
     capture = padgs.data.read(source)
-    plan = blocks.plan(capture, assemble(capture, DataOptions()), 2)
+    plan = block_plan.plan(capture, assemble(capture, DataOptions()), 2)
     for core, margin, held, scene, part in zip(plan.core, plan.margin, plan.held, loaded, parts, strict=True):
         sides = {float(view.center[0]) > 0 for view in core}
         assert len(core) == 8 and len(sides) == 1
         near = [abs(float(view.center[0])) for view in margin]
         assert 2 <= len(margin) <= 6 and max(near) < 2.5, "those near the door"
         shares = {view.name: view.share for view in scene.train}
-        assert shares == pytest.approx({name: blocks.sphere_share(part) for name, part in held.items()}, abs=1e-4)
+        assert shares == pytest.approx({name: block_plan.sphere_share(part) for name, part in held.items()}, abs=1e-4)
         for view in scene.train:
             mask = view.mask()
             assert mask is not None and abs(mask.mean() - held[view.name].mean()) < 0.05
         assert min(shares[view.name] for view in core) > 0.5 > max(shares[view.name] for view in margin) - 0.2
         assert len(scene.points) < 0.9 * len(whole.points)
         assert all(path.is_symlink() for path in (part / "images").iterdir())
-    alone = blocks.plan(capture, assemble(capture, DataOptions(split="all")), 2)
+    alone = block_plan.plan(capture, assemble(capture, DataOptions(split="all")), 2)
     assert alone.test == [[], []] and sum(map(len, alone.core)) == 20
     tests = [view.name for scene in loaded for view in scene.test]
     assert sorted(tests) == sorted(view.name for view in whole.test)
@@ -211,7 +215,8 @@ def test_the_source_is_found_through_links(source, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
     Image.new("L", (32, 16), 255).save("elsewhere/all.png")
-    settings = ["--blocks", "2", "--to", "link/parts", "--mask", "elsewhere/all.png"]
+    shutil.move("rooms/points.ply", "elsewhere/lidar.ply")
+    settings = ["--blocks", "2", "--to", "link/parts", "--mask", "elsewhere/all.png", "--points", "elsewhere/lidar.ply"]
     done = CliRunner().invoke(app, ["split", "rooms", *settings])
     assert done.exit_code == 0, done.output
     runs = [trained(real / "parts" / f"rooms-block-{number}", tmp_path / "runs") for number in (1, 2)]
@@ -232,6 +237,12 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
     assert "whose parts share parameters" in error(trained(parts[0], tmp_path, "method=padgs"), runs[1])
     assert "has other settings of method" in error(runs[0], trained(parts[1], tmp_path, "method.sh_degree=1"))
     assert "name the folder of the blocks with --data" in error(trained(source, tmp_path), runs[1])
+    every = trained(parts[1], tmp_path, "data.split=every", "data.test_every=4")
+    assert "has data.split=every, with other test views than the whole" in error(runs[0], every)
+    whole = [trained(part, tmp_path, "data.split=all") for part in parts]
+    assert "has data.split=all, with other test views" in error(runs[0], whole[1])
+    merged = padgs.load_run(merge(whole, Console(quiet=True)), device="cpu")
+    assert not merged.scene.test and not merged.result.scores, "all views were trained on"
     text = (described := parts[0] / BLOCK).read_text()
     damages = {"": "block.json is empty", "{": "is not valid JSON", "[1]": "must be an object", "{}": "lacks the field"}
     for damage, words in damages.items():
@@ -249,7 +260,7 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
 def test_blocks_are_beside_the_working_folder_too(tmp_path, monkeypatch):
     (tmp_path / "capture").mkdir()
     monkeypatch.chdir(tmp_path / "capture")
-    monkeypatch.setattr(blocks, "split", lambda source, destination, *_: {destination: ""})
+    monkeypatch.setattr(blocks, "split", lambda source, destination, *_: ({destination: ""}, ()))
     done = CliRunner().invoke(app, ["split", ".", "--blocks", "2"])
     assert str(tmp_path / "capture-blocks") in done.output.replace("\n", "")
 

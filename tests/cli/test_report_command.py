@@ -159,6 +159,8 @@ def test_all_writes_every_report(tmp_path):
 def test_a_refused_report_does_not_stop_the_others(tmp_path):
     first, *others = compared(["synthetic-room"], seeds=1)
     write([replace(first, machine={"gpu": "H200"}), *others], tmp_path / "runs")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "table4.md").write_text("of other runs")
     done = report("all", tmp_path / "runs", "--out", tmp_path / "out", "--strict")
     assert done.exit_code == 1 and "error: table4: " in done.output and "differ in machine" in done.output
     assert (tmp_path / "out" / "table1.md").exists() and not (tmp_path / "out" / "table4.md").exists()

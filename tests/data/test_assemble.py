@@ -14,7 +14,7 @@ from PIL import Image
 from support.fixtures import World, write_colmap_text, write_transforms
 from torch import Tensor
 
-from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
+from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load, read
 from padgs.data.assemble import disk_cache
 from padgs.data.capture import Cloud
 from padgs.data.cloud import write_ply
@@ -66,18 +66,39 @@ def test_georeferenced_captures_are_recentered(world: World, folder: Path, tmp_p
         torch.testing.assert_close(other.center + shift, one.center, atol=1e-6, rtol=0)
 
 
-def test_points_of_another_world_than_the_cameras_are_refused(world: World, folder: Path) -> None:
-    cloud = Cloud(torch.from_numpy(world.points) + torch.tensor([5e5, 5.4e6, 0.0]), None)
-    write_ply(folder / "map.ply", cloud)
+@pytest.mark.parametrize("size", [1, 500])
+def test_points_of_another_world_than_the_cameras_are_refused(size: int, world: World, tmp_path: Path) -> None:
+    """A room, and a campus of kilometres."""
+    write_colmap_text(replace(world, centers=size * world.centers, points=size * world.points), tmp_path)
+    cloud = Cloud(torch.from_numpy(size * world.points) + torch.tensor([5e5, 5.4e6, 0.0]), None)
+    write_ply(tmp_path / "map.ply", cloud)
     with pytest.raises(DataError, match=r"so not in one world; export both .*Metashape: points in local coordinates"):
-        load(folder, points="map.ply")
+        load(tmp_path, points="map.ply")
+
+
+def test_a_far_view_is_one_world(world: World, tmp_path: Path) -> None:
+    far = world.points + 20 * np.abs(world.points).max() * np.array([1.0, 0.0, 0.0])
+    write_colmap_text(replace(world, points=far), tmp_path)
+    assert len(load(tmp_path).points) == len(far)
+
+
+def test_images_and_points_may_be_named_from_the_working_directory(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (folder / "images").rename(tmp_path / "panos")
+    write_ply(tmp_path / "lidar.ply", Cloud(torch.rand(50, 3, dtype=torch.float64), None))
+    scene = load(folder, images="panos", points="lidar.ply")
+    assert len(scene.points) == 50 and scene.train[0].image().shape[-1] == 3
+    with pytest.raises(DataError, match="data.images=photos: there is no folder .*photos; name it from"):
+        load(folder, images="photos")
 
 
 def test_images_and_cameras_of_different_size(folder: Path) -> None:
     for path in (folder / "images").glob("*.png"):
         Image.open(path).resize((32, 16)).save(path)
     assert any("pano_00.png is 32x16, its camera 64x32; used as they are" in note for note in load(folder).notes)
-    Image.new("RGB", (64, 32)).save(folder / "images" / "pano_03.png")
+    Image.new("RGB", (64, 32)).save(folder / "images" / "pano_03.png")  # of the same camera
     with pytest.raises(DataError, match="images and cameras disagree in size: .*pano_00.png .*pano_03.png"):
         load(folder)
 
@@ -339,3 +360,17 @@ def test_pointers_of_git_lfs_are_named(folder: Path) -> None:
         ):
             load(folder)
         (folder / name).write_bytes(kept)
+
+
+def test_two_cameras_may_be_reduced_to_one_size(folder: Path) -> None:
+    """Theta S and Z1 in one model, all images resized."""
+    cameras = folder / "sparse/0/cameras.txt"
+    (line,) = [line for line in cameras.read_text().splitlines() if not line.startswith("#")]
+    number, rest = line.split(maxsplit=1)
+    cameras.write_text(f"{line}\n{int(number) + 1} {rest.replace('64', '128').replace('32', '64')}\n")
+    images = folder / "sparse/0/images.txt"
+    text = images.read_text()
+    images.write_text(text.replace(f" {number} pano_01.png", f" {int(number) + 1} pano_01.png"))
+    assert images.read_text() != text
+    sizes = [(frame.width, frame.height) for frame in read(folder).frames]
+    assert {*sizes} == {(64, 32), (128, 64)} and {view.width for view in load(folder).train} == {64}

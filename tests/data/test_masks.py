@@ -185,6 +185,20 @@ def test_masks_relative_to_the_working_directory(folder: Path, monkeypatch: pyte
     assert load(folder, mask=str(folder / "hands.png")).train[0].mask() is not None
 
 
+def test_masks_that_the_data_set_states_are_its_own(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_transforms(world, tmp_path / "block")
+    file = tmp_path / "block/transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"mask": "masks"}))
+    for name in world.names:
+        _mask(tmp_path / "block/masks" / f"{name}.png")
+        _mask(tmp_path / "masks" / f"{name}.png", hidden_rows=9)
+    monkeypatch.chdir(tmp_path)
+    mask = load(tmp_path / "block").train[0].mask()
+    assert mask is not None and mask[-9:].any()
+
+
 def test_writing_masks_keeps_two_in_memory(tmp_path: Path) -> None:
     made: list[weakref.ref] = []
     alive: list[int] = []

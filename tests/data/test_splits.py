@@ -51,6 +51,15 @@ def test_every_kth(tmp_path: Path) -> None:
     assert (len(everything.train), everything.test) == (17, ())
 
 
+@pytest.mark.parametrize(
+    ("mode", "stated"), [("auto", None), ("files", None), ("all", None), ("auto", {"test": ("b",)})]
+)
+def test_a_step_that_decides_nothing_is_refused(mode: str, stated, tmp_path: Path) -> None:
+    folder = tmp_path if stated else _lists(tmp_path, None, "b")
+    with pytest.raises(DataError, match=r"data.test_every=4 changes nothing, because .* decides; .* data.split=every"):
+        split_frames(NAMES, folder, mode=mode, every=4, stated=stated)
+
+
 def test_the_split_of_the_format_takes_precedence(tmp_path: Path) -> None:
     _lists(tmp_path, "a", "b")
     stated = {"train": ("c.jpg",), "test": ("sub/d.png",)}

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 import torch
-from support.made_up import failed, result, small
+from support.made_up import external, failed, result, small
 
 from padgs.reports.frame import by_place, frame, images_seen
 from padgs.reports.published import Place
@@ -102,3 +102,28 @@ def test_no_two_places_share_a_title_or_a_name_of_files():
     places = [Place(dataset, scene, apart) for dataset in datasets for scene in scenes for apart in ("", "data 0123")]
     assert len({place.title for place in places}) == len({place.stem for place in places}) == len(places)
     assert [Place("", "room").stem, Place("synthetic", "synthetic-room").stem] == ["room", "synthetic-room"]
+
+
+def test_limits_of_the_model_are_named_with_the_length():
+    lengths = (
+        {"gaussians": 20_000},
+        {"gaussians": "auto", "stop": "auto"},
+        {"seconds": 60.0, "clock": "cpu", "gaussians": 9},
+    )
+    made = [small(25.0, config={"budget": budget}, seed=seed) for seed, budget in enumerate(lengths)]
+    assert frame(map(Run, made))["length"].tolist() == [
+        "1500 iterations, at most 20 000 Gaussians",
+        "1500 iterations, Gaussians as needed, until nothing is gained",
+        "60 s of CPU time, at most 9 Gaussians",
+    ]
+
+
+def test_data_from_files_have_no_setting_of_the_generator():
+    data = [{"path": "flat", "generator": {"width": 256}}, {"path": "flat"}, {"generator": {"width": 256}}]
+    made = frame(map(Run, [small(25.0, config={"data": one}, seed=seed) for seed, one in enumerate(data)]))
+    assert made["setting"].nunique() == 2 and made["setting"][0] == made["setting"][1]
+
+
+def test_models_of_other_programs_have_no_learning_rates():
+    made = frame(map(Run, [external(25.0, "Brush")]))
+    assert made["learning_rates"].isna().all() and made["rate_factor"].isna().all()

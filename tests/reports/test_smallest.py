@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import pytest
-from PIL import Image
 from support.made_up import run_set, small
 
 from padgs.reports.smallest import charts, table
@@ -90,13 +89,3 @@ def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     assert chart.name == "smallest_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
     assert list(chart.numbers["smallest for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
-
-
-def test_a_test_view_is_shown_at_each_size_where_there_is_an_image_of_it(tmp_path):
-    found = run_set(runs())
-    assert len(charts(found)) == 1
-    Image.new("RGB", (4 * 32, 16), "red").save(tmp_path / "smallest.png")
-    found.runs["renders"] = [tmp_path / "renders"] * len(found.runs)
-    _, sheet = charts(found)
-    assert sheet.name.endswith("_renders") and "all: 8000 Gaussians" in sheet.svg
-    assert "0.1 dB: 4000" in sheet.svg and "1 dB: 1000" in sheet.svg

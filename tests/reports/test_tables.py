@@ -314,6 +314,13 @@ def test_the_best_stands_first_by_a_metric_that_falls():
     assert [row.cells[0].value for row in block.rows] == [1, 2, 2, 4]
 
 
+def test_ranks_are_of_the_metric_that_is_shown():
+    table = order(run_set(ordered(), metrics=("lpips_vgg_01",)))
+    assert any(note.startswith("Rank: ") and "by LPIPS" in note for note in table.notes)
+    count = order(run_set(ordered(), metrics=("gaussians",)))
+    assert columns(count) == ["Gaussians"] and not any(note.startswith("Rank: ") for note in count.notes)
+
+
 def test_a_metric_without_a_protocol_is_of_the_one_asked_for():
     table = modulation(run_set(crossed(), protocol="sphere", metrics=("psnr",)))
     assert columns(table) == ["PSNR"]

@@ -8,6 +8,7 @@ from PIL import Image
 from support.made_up import builder, data_set, failed, result, run_set
 
 from padgs.reports.charts.drawing import Chart
+from padgs.reports.table import Cell, Column, Row
 from padgs.reports.writers import _line, files, latex
 
 runs = builder("runs")
@@ -80,3 +81,12 @@ def test_charts_of_scenes_whose_names_differ_in_signs_only_have_files_of_their_o
     charts = [Chart("chart_a/b", "a/b", Image.new("RGB", (1, 1))), Chart("chart_a-b", "a-b", Image.new("RGB", (1, 1)))]
     names = [name for name, _ in files(charts)]
     assert names[0] == "chart_a-b.png" and re.fullmatch(r"chart_a-b-[0-9a-f]{9}\.png", names[1])
+
+
+def test_numbers_of_seeds_stand_beside_cells_where_they_differ():
+    columns = [Column("PSNR", 1)] * 3
+    limit, three, one = Cell(2.0, count=0), Cell(1.5, 0.1, 3), Cell(2.5)
+    assert Row("a", (limit, three, three)).texts(columns)[0] == "a (n=3)", "a limit is of no run"
+    assert Row("a", (limit, three, one)).texts(columns) == ["a", "2.0", "1.5 ± 0.1 (n=3)", "2.5 (n=1)"]
+    assert Row("a", (limit, one, one)).texts(columns) == ["a", "2.0", "2.5", "2.5"]
+    assert [cell.numbers["n"] for cell in (limit, three, one, Cell())] == [None, 3, 1, None]

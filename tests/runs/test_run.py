@@ -171,6 +171,10 @@ def test_lpips_that_lacked_weights_is_added_once_there_are_some(config, monkeypa
     assert run(asked)[0] == without
     monkeypatch.setattr(pipeline, "has_weights", lambda net: net == "vgg")
     monkeypatch.setattr(evaluate, "lpips", lambda *_, **__: torch.tensor(0.25))
+    checkpoint = folder_of(asked).checkpoint
+    checkpoint.rename(checkpoint.with_name("moved"))
+    assert run(asked)[0] == without, "nothing is left to score"
+    checkpoint.with_name("moved").rename(checkpoint)
     assert run(asked)[0].scores["paper"].metrics["lpips_vgg_01"] == 0.25
     assert run(asked)[1].count("nothing to do") == 1
 

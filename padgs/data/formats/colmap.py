@@ -72,7 +72,6 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
         points = model_files.read_points(files["points3D"])
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
     notes = [*_file_notes(path, model, files, colored is not None), *_reference_notes(images, points)]
-    notes += _frame_notes(model, files["images"], images)
     tracks = partial(_tracks, images, points.row_of)
     return Capture("colmap", path, folder, frames, points.cloud, tracks=tracks, notes=tuple(notes))
 
@@ -94,20 +93,6 @@ def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) 
     if double := [file.name for file in files.values() if file.suffix.lower() == ".bin" and file.stem in texts]:
         notes.append(f"the model is there as text and binary; {listed(double)} are used, not the text files")
     return notes
-
-
-def _frame_notes(model: Path, file: Path, images: list[model_files.Image]) -> list[str]:
-    """Say where the poses of frames.bin (COLMAP 4) differ from those of the images file."""
-    frames = model_files.read_frames(model / "frames.bin") if (model / "frames.bin").is_file() else {}
-    flip = np.array([-1, -1, -1, -1, 1, 1, 1])  # a quaternion and its negative are one rotation
-    differing = [
-        image.name
-        for image in images
-        if (stated := frames.get(image.id))
-        and not any(np.allclose(stated, sign * np.array(image.pose), 1e-6, 1e-6) for sign in (1, flip))
-    ]
-    used = f"those of {file.name} are used: remove the file that is out of date"
-    return [f"frames.bin states other poses than {file.name} ({listed(differing)}); {used}"] if differing else []
 
 
 def _reference_notes(images: list[model_files.Image], points: model_files.Points) -> list[str]:

@@ -143,16 +143,6 @@ def read_points(file: Path) -> Points:
     return Points({row[0]: i for i, row in enumerate(rows)}, cloud, frozenset(seen_by))
 
 
-def read_frames(file: Path) -> dict[int, tuple[float, ...]]:
-    """Read frames.bin of COLMAP 4: image id -> pose as in `Image`, for the frames of a single image."""
-
-    def entry(cursor: _Cursor) -> tuple[tuple[float, ...], list[int]]:
-        _, _, *pose, count = cursor.take("II7dI")
-        return tuple(pose), [cursor.take("iIQ")[2] for _ in range(count)]
-
-    return {images[0]: pose for pose, images in _entries(file, entry) if len(images) == 1}
-
-
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines of a text file that are neither empty nor comments, with their numbers."""
     errors = "surrogateescape" if file.stem.lower() == "images" else "replace"  # names are refused later, with advice

@@ -231,17 +231,6 @@ def test_points_may_be_a_ply_file_beside_the_model(world: World, tmp_path: Path)
     assert "points: from a PLY file beside the model" in _notes(tmp_path)
 
 
-def test_old_frames_beside_new_images_are_reported(world: World, tmp_path: Path) -> None:
-    write_colmap_binary(world, tmp_path)
-    assert "state other poses" not in _notes(tmp_path)
-    file = tmp_path / "sparse/0/images.bin"
-    data = bytearray(file.read_bytes())
-    data[44:52] = struct.pack("<d", 0.25)  # tx of the first image
-    file.write_bytes(data)
-    assert "frames.bin states other poses than images.bin (pano_00.png); those of images.bin are" in _notes(tmp_path)
-    assert read(tmp_path).frames[0].cam_from_world[0, 3] == 0.25
-
-
 def test_text_and_binary_in_one_folder(world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
     (tmp_path / "sparse/0/images.txt").write_text("1 0 0 0 0 0 0 0 1 other.png")

@@ -129,6 +129,21 @@ def test_equal_labels_are_those_of_folders(folder: Path) -> None:
         read(folder)
 
 
+def test_labels_without_folder_or_ending_are_found_in_folders(folder: Path) -> None:
+    """Only labels that occur twice have their group in front."""
+    for name in ("Group 1", "day 2"):
+        (folder / "images" / name).mkdir()
+    for number in range(6):
+        place = "Group 1" if number < 2 else "day 2"
+        (folder / f"images/pano_0{number}.png").rename(folder / f"images/{place}/pano_0{number}.JPG")
+    names = [frame.name for frame in read(folder).frames]
+    assert names == [f"{'Group 1' if n < 2 else 'day 2'}/pano_0{n}.JPG" for n in range(6)]
+    (folder / "images/third").mkdir()
+    (folder / "images/third/pano_03.png").touch()
+    with pytest.raises(DataError, match="'pano_03.png' of the metashape data set may be day 2/.*, third/"):
+        read(folder)
+
+
 def test_without_transforms_the_frame_is_that_of_the_chunk(folder: Path) -> None:
     _edit(folder, ('component_id="1"', 'component_id="0"'), (r"(?s)</cameras><transform>.*</transform>", "</cameras>"))
     _edit(folder, (r"(?s)<components>.*</components>", ""))

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -5,6 +6,7 @@ import numpy as np
 import pytest
 from support.made_up import METHODS, assert_apart, at_equal_time, compared, data_set, run_set, small, write
 
+from padgs import results
 from padgs.reports import store
 from padgs.reports.charts import trade_off_chart
 from padgs.reports.charts.trade_off import equal_times, pareto, trade_offs
@@ -134,6 +136,31 @@ def test_a_curve_is_a_mean_over_scenes_and_of_finished_runs(tmp_path):
     ends = {setting.preset: psnr[-1] for setting, _, psnr in trade_off_chart._curves(logged)}
     assert ends == pytest.approx(dict.fromkeys(("omnigs", "padgs"), 25 - 8 / 15))
     assert logged.notes[-1] == "Failed runs are left out: SPaGS (DEGENERATE)."
+
+
+def test_seeds_of_a_time_are_averaged_however_many_iterations_they_made(tmp_path):
+    made = [small(20.0 + 4 * seed, seed=seed, run=f"seed{seed}", iterations_done=1500) for seed in range(3)]
+    write(made, tmp_path)
+    log = tmp_path / "seed2" / "log.jsonl"  # twice as fast, and twice as many iterations
+    results.write(replace(made[2], iterations_done=3000), tmp_path / "seed2")
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    fast = [{**one, "iteration": n} for one in lines for n in (2 * one["iteration"] - 100, 2 * one["iteration"])]
+    log.write_text("".join(json.dumps(line) + "\n" for line in fast))
+    (logged,) = trade_offs(RunSet(frame(store.read(tmp_path)[0])))
+    ((_, seconds, psnr),) = trade_off_chart._curves(logged)
+    assert psnr[-1] == pytest.approx(24 - 8 / 15) and seconds[-1] == pytest.approx(100)
+    log.write_text("".join(json.dumps(line) + "\n" for line in fast[:-1]))
+    (cut,) = trade_offs(RunSet(frame(store.read(tmp_path)[0])))
+    assert trade_off_chart._curves(cut)[0][2][-1] == pytest.approx(22 - 8 / 15)
+    assert time_chart(cut).notes[-1] == "Without a complete log, so in no line: seed2."
+
+
+def test_a_legend_counts_the_seeds_of_its_bars():
+    runs = [small(25.0 + seed, seed=seed, run=f"a{seed}") for seed in range(3)]
+    runs += [small(24.0 + seed, method="omnigs", seed=seed, run=f"b{seed}") for seed in range(2)]
+    assert "deviation over 2 to 3 seeds" in trade_off_chart._conditions(one(runs))
+    single = [small(25.0), small(24.0, method="omnigs", seed=1)]
+    assert "deviation" not in trade_off_chart._conditions(one(single))
 
 
 def test_time_is_cpu_time_where_that_is_known(tmp_path, monkeypatch):
