@@ -1,6 +1,7 @@
 """Numbers that are written by hand in the README and the page on padgs+ are those of the measured tables."""
 
 import re
+from importlib.util import module_from_spec, spec_from_file_location
 
 import pytest
 
@@ -124,3 +125,14 @@ def test_the_answers_of_the_readme(root, after_a_minute):
     ]
     answers[-2:] = [re.sub(r"(\d)(000)\b", r"\1 \2", answer) for answer in answers[-2:]]
     assert [answer for answer in answers if answer not in text] == [], "write these into the README"
+
+
+def test_links_to_measured_tables_lead_to_pages_of_the_site(root):
+    pytest.importorskip("mkdocs")
+    spec = spec_from_file_location("docs_site", root / "docs" / "site.py")
+    hook = module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    links = "[a](../reports/measured/order.md#x), ![b](../../reports/measured/c.png), [d](../../docs/plus.md)"
+    inside = "[a](measured/order.md#x), ![b](../measured/c.png), [d](../plus.md)"
+    assert hook.on_page_markdown(links, page=None) == inside
+    assert "hooks: [docs/site.py]" in (root / "mkdocs.yml").read_text()
