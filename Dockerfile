@@ -24,6 +24,6 @@ RUN python3 -m venv /opt/padgs \
     && /opt/padgs/bin/pip install --no-cache-dir --no-deps -r /wheels/requirements-nodeps.txt
 # NVIDIA's runtimes show a container the GPU; caches go where any user may write.
 ENV PATH=/opt/padgs/bin:$PATH NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility \
-    MPLCONFIGDIR=/tmp/matplotlib
+    MPLCONFIGDIR=/tmp/matplotlib PADGS_CACHE=/tmp/padgs
 WORKDIR /work
 CMD ["padgs", "--help"]

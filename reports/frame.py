@@ -252,7 +252,6 @@ def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:
     if "steps" in found:
         [found["steps"][found[of][f"{loss:g}"]] for loss in SMALLEST_LOSSES for of in ("minimal", "possible")]
         [float(found[name] or 0) for name in ("rows", "cpu_seconds", "ws_psnr")]
-        found["steps"][found["knee"] or 0]
     return found
 
 

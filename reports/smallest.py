@@ -26,7 +26,6 @@ NOTES = (
     "less what was lost against the control. Not searched: offsets per anchor, features.",
     "At least: the smallest model that is not known to lose more, with 95 % confidence; the interval of the minimal "
     "count begins there.",
-    "Knee: the largest model below which a halving costs more than 0.1 dB.",
 )
 
 
@@ -84,20 +83,14 @@ def by_method(found: Sequence[Curve]) -> dict[str, list[Curve]]:
     return {method: [one for one in found if one.method == method] for method in methods}
 
 
-def _count(own: Curve, number: int | None) -> float | None:
-    """Return the count of a candidate that `padgs smallest` names, if any."""
-    return None if number is None else own.found["steps"][number]["blended"]
-
-
 COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
     Column("Gaussians blended", 0): lambda own: own.found["steps"][0]["blended"],
     **{
         Column(f"minimal count for {loss:g} dB", 0, False): lambda own, e=f"{loss:g}": own.smallest[e]["blended"]
         for loss in SMALLEST_LOSSES
     },
-    Column(f"at least, for {STATED} dB", 0): lambda own: _count(own, own.found["possible"][STATED]),
+    Column(f"at least, for {STATED} dB", 0): lambda own: own.found["steps"][own.found["possible"][STATED]]["blended"],
     Column(f"share for {STATED} dB", 2): lambda own: own.smallest[STATED]["rows"] / own.found["rows"],
-    Column("knee", 0): lambda own: _count(own, own.found["knee"]),
     Column(f"MB for {STATED} dB", 2, False): lambda own: own.smallest[STATED]["bytes"] / 1e6,
     Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own: own.smallest[STATED]["frame_ms"],
     Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own: own.quality_of(own.smallest[STATED]),

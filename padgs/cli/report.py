@@ -65,10 +65,10 @@ def report(
         except ReportError as error:
             refused += 1
             show(f"{'error' if single or strict else 'left out'}: {name}: {error}", sys.stderr)
-            for ending in ("md", "tex", "csv"):  # an old table must not lie beside new ones
-                (target / f"{name}.{ending}").unlink(missing_ok=True)
             if single:
                 raise typer.Exit(1) from error
+            for ending in ("md", "tex", "csv"):  # an old table must not lie beside new ones
+                (target / f"{name}.{ending}").unlink(missing_ok=True)
             continue
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")

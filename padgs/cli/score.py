@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Cameras, Format, Images, Mask, Rays, Split, Transform, check_range, show
+from padgs.cli.errors import Cameras, Depth, Format, Images, Mask, Points, Rays, Split, Transform, check_range, show
 
 
 def score(
@@ -20,6 +20,8 @@ def score(
     width: Annotated[int, typer.Option(help="reduce the photographs to this width; 0: as they are")] = 0,
     mask: Mask = "",
     images: Images = "",
+    points: Points = "",
+    depth: Depth = "",
     cameras: Cameras = "",
     split: Split = "",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
@@ -46,7 +48,8 @@ def score(
         raise FileNotFoundError(f"there is no {model}; give a file of Gaussians, or a folder of renders")
     if not path.is_dir() and not is_splat_file(model):
         raise ValueError(f"{model} is no .ply, .compressed.ply, .spz or .sog, and no folder of renders")
-    settings = {"format": format, "width": width, "mask": mask, "images": images, "cameras": cameras, "split": split}
+    settings = {"format": format, "width": width, "mask": mask, "images": images, "points": points}
+    settings |= {"depth": depth, "cameras": cameras, "split": split}
     with console.status("opening the data set") as status:
         config = config_of(data, device=device, **settings)
         if path.is_dir():

@@ -156,14 +156,16 @@ def disk_cache(options: DataOptions, size: int) -> tuple[Path | None, list[str]]
     """
     if size <= options.cache_bytes or options.disk_cache == "off":
         return None, []
+    gigabytes = f"{size / 1e9:.1f} GB of decoded images exceed data.cache_bytes"
     folder = Path(options.disk_cache) if options.disk_cache != "auto" else cache_root() / "images"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(folder).free + sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
     except OSError as error:
         why = f"cannot write {folder}: {error.strerror}"
+        if options.disk_cache == "auto":
+            return None, [f"images: {gigabytes}, and the disk cache {why}; each is decoded when it is needed"]
         raise DataError(f"data.disk_cache: {why}; name another folder, or off") from error
-    gigabytes = f"{size / 1e9:.1f} GB of decoded images exceed data.cache_bytes"
     if 2 * size > free:
         return None, [f"images: {gigabytes} and half of the free space of {folder}; each is decoded when it is needed"]
     return folder, [f"images: {gigabytes}, they are kept in {folder} (data.disk_cache; it may be deleted)"]

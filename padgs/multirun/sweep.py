@@ -34,7 +34,7 @@ from padgs.checks import printable, typed, unknown
 from padgs.multirun.finished import FinishedJobs, signature
 from padgs.multirun.job import Board, JobState, Status, complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
-from padgs.multirun.slurm import TOO_MANY, SubmissionRefused, wait_for_jobs
+from padgs.multirun.slurm import NO_ANSWER, TOO_MANY, SubmissionRefused, wait_for_jobs
 from padgs.results import Result, ResultError
 from padgs.runs.config import RETRIES, RunOptions
 from padgs.runs.console import Display, compact, duration, psnr_of, say, write
@@ -44,7 +44,9 @@ from padgs.runs.store import RunStore, cannot_write, labels
 from padgs.runs.tracking import Tracker, TrackingOptions
 
 ATTEMPTS = 2  # of a job that began and whose process died: another job may have caused it
-IDLE_LAUNCHES = 5  # in a row in which no job began
+IDLE_LAUNCHES = 3  # in a row in which no job began
+RETRIES_OF_SLURM, SECONDS_BETWEEN_RETRIES = 30, 60.0  # of a submission that Slurm did not answer
+LEFT_QUEUE = "a job left Slurm's queue before it began: by scancel, or because a node cannot write to run.folder"
 SECONDS_BETWEEN_TICKS = 1.0
 MOST_ROWS = 40  # of the table at the end
 SECONDS_BETWEEN_LINES = 30.0  # without a terminal
@@ -112,7 +114,8 @@ class Multirun:
         """Launch the missing jobs, all or some at a time; if stopped from outside, running jobs write checkpoints."""
         if self.before and self.jobs:
             self._say(self.line())
-        waiting, attempts, launched, idle = list(self.states), Counter[int](), 0, 0
+        waiting, attempts, launched, idle, retries = list(self.states), Counter[int](), 0, 0, 0
+        most = batch_size or len(waiting)
         try:
             self.board.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -126,11 +129,16 @@ class Multirun:
             error = self._launch(launcher, [self.jobs[index] for index in batch], launched)
             launched += len(batch)
             self._follow(batch)
+            if isinstance(error, SubmissionRefused) and NO_ANSWER.search(str(error)) and retries < RETRIES_OF_SLURM:
+                waiting, retries = batch + waiting, retries + 1
+                time.sleep(SECONDS_BETWEEN_RETRIES)
+                continue
             if isinstance(error, SubmissionRefused):
                 waiting, batch_size = batch + waiting, len(batch) // 2 if TOO_MANY.search(str(error)) else 0
                 while not batch_size and waiting:
                     self._end(waiting.pop(0), JobState(Status.REFUSED, reason=str(error)))
                 continue
+            batch_size, retries = min(most, 2 * batch_size) if batch_size else None, 0
             if self.board.stop_requested():
                 raise Interrupted("stopped, running jobs wrote their checkpoints")
             left = [index for index in batch if not self.states[index].ended]
@@ -141,8 +149,10 @@ class Multirun:
             for index in lost:
                 is_refused = self._in_process or (error and self.states[index].status == Status.WAITING)  # none began
                 status = Status.REFUSED if is_refused else Status.KILLED
-                ended = "no job began" if error and status == Status.REFUSED else "a job ended without a status"
-                reason = f"{ended}: {error or f'check the free space in {self.runs}'}"
+                began = self.states[index].status != Status.WAITING
+                ended = "a job ended without a status" if began else "no job began"
+                why = f"look for lack of memory or time, or a full disk, in its output in {self.board.folder}"
+                reason = f"{ended}: {error or why}"
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
 
@@ -152,7 +162,9 @@ class Multirun:
 
     def line(self) -> str:
         """Read the board and sum it up."""
-        self._follow(index for index, state in self.states.items() if not state.ended and self._numbers[index] >= 0)
+        # Slurm requeues what it preempts.
+        open_ones = (index for index, of in self.states.items() if not of.ended or of.status == Status.STOPPED)
+        self._follow(index for index in open_ones if self._numbers[index] >= 0)
         return status_line(self.before, [*self.states.values()], time.monotonic() - self._began)
 
     def close(self) -> Counter[str]:
@@ -170,7 +182,7 @@ class Multirun:
         alive = any(self._numbers[index] >= 0 and not state.ended for index, state in self.states.items())
         if not self._in_process and alive:  # after a second Ctrl-C: `stop` is there, and files of submitit
             self._say(f"jobs may still be running; their files and output are in {self.board.folder}")
-        elif not self._in_process and {Status.CRASHED, Status.KILLED} & {*counts}:
+        elif not self._in_process and ({Status.CRASHED, Status.KILLED} & {*counts} or LEFT_QUEUE in self._reasons):
             self._say(f"the output of crashed jobs is in {self.board.folder}")
         else:
             shutil.rmtree(self.board.folder, ignore_errors=True)
@@ -209,7 +221,8 @@ class Multirun:
         self.states[index] = state
         if state.data:
             signature(state.data)  # kept: what is stored at the end is of the data before training
-        if state.status in Status.EXPLAINED and state.reason not in self._reasons:
+        is_explained = state.status in Status.EXPLAINED or state.reason == LEFT_QUEUE
+        if is_explained and state.reason not in self._reasons:
             self._reasons.add(state.reason)  # once: a missing data set is missing for all rows of a table
             complain(state.reason)
         if state.status in results.STATUSES and state.run:
@@ -316,7 +329,7 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
         raise SubmissionRefused(f"Slurm takes no job: {error}") from error
     if cluster == "slurm":
         for position in wait_for_jobs(submitted, board.stop_requested):
-            left = JobState(Status.STOPPED, reason="it left the queue of Slurm before it began")
+            left = JobState(Status.STOPPED, reason="not started" if board.stop_requested() else LEFT_QUEUE)
             if board.read(first_number + position).status == Status.WAITING:  # its log may be on another machine
                 board.write(first_number + position, left)
         return

@@ -24,7 +24,6 @@ MIN_VIEWS = 3  # test views; the bound of two is 13 times as far from their mean
 CONFIDENCE, MAX_LPIPS_RISE = 0.95, 0.005
 BAND, WORST = 2.0, 5.0  # a latitude band may lose so many epsilons on average, a view so many
 MIN_SHARE = 0.02  # of the sphere; smaller latitude bands, or what masks leave of them, decide nothing
-SLOPE, OCTAVE = 0.1, 0.5  # knee: dB per halving, measured over at least this part of a halving
 
 
 @dataclass(frozen=True)
@@ -144,16 +143,4 @@ def next_count(candidates: Sequence[Candidate], losses: Sequence[float], shares:
         middle = round(math.sqrt(rows * below))
         if rows > CLOSE * below and below < middle < rows:
             return middle
-    return None
-
-
-def knee(candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the largest candidate below which a halving costs more than 0.1 dB; None if none does."""
-    order = sorted(candidates, key=lambda candidate: -candidate.rows)
-    for one in order:
-        lower = next((other for other in order if other.rows <= 2**-OCTAVE * one.rows), None)
-        if lower is not None:
-            fall = loss(candidates, lower) - loss(candidates, one)
-            if fall / math.log2(one.rows / lower.rows) > SLOPE:
-                return one
     return None

@@ -1,5 +1,6 @@
 """The configuration of a run. Its keys are the fields of dataclasses; the files in `conf/` only override defaults."""
 
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -298,6 +299,10 @@ def choose_device(name: str, render: RenderConfig) -> torch.device:
     try:
         cuda.require(gpu)
     except (OSError, RuntimeError) as error:
+        if os.environ.get("SLURM_JOB_GPUS"):  # which others wait for
+            raise ValueError(
+                f"this job of Slurm has a GPU, which is not used: {error}; or set run.device=cpu"
+            ) from error
         warnings.warn(f"a GPU is here, but the CPU is used: {error}", stacklevel=2)
         return torch.device("cpu")
     return gpu

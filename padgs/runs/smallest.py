@@ -119,11 +119,11 @@ class Search:
 
         Returns:
             row: gaussians or anchors; rows, ws_psnr: of the searched run; minimal, possible: epsilon -> index of
-            `smallest`, `smallest_possible`; knee: index, or None; steps: all candidates, the control first, each with
+            `smallest`, `smallest_possible`; steps: all candidates, the control first, each with
             its loss against the control and the objections at each epsilon; views: names of those that decide;
             seconds, cpu_seconds: of all candidates.
         """
-        found, bend = self.candidates, candidates.knee(self.candidates)
+        found = self.candidates
         whole = evaluate(self.run.method.render, self.run.scene.test, replace(RULES, lpips="none"))
         return {
             "row": self.row,
@@ -131,7 +131,6 @@ class Search:
             "ws_psnr": whole.metrics[candidates.QUALITY],
             "minimal": {f"{e:g}": found.index(candidates.smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
             "possible": {f"{e:g}": found.index(candidates.smallest_possible(found, e)) for e in SMALLEST_LOSSES},
-            "knee": None if bend is None else found.index(bend),
             "steps": [self._described(one) for one in found],
             "views": [*self.shares],
             "seconds": math.fsum(one.seconds for one in found),
@@ -198,16 +197,13 @@ def find_smallest(
 
 
 def show(found: dict[str, Any], console: Console) -> None:
-    """Print the smallest model for each loss, the knee, and the cost of the search."""
+    """Print the smallest model for each loss, and the cost of the search."""
     steps = found["steps"]
     table = Table(Column("loss", no_wrap=True), box=SIMPLE_HEAD, pad_edge=False)
     for column in (found["row"], "interval", "MB", "ms", "dB lost", "dB"):
         table.add_column(column, justify="right", no_wrap=True)
-    titled = {"control": 0, **{f"{epsilon} dB": at for epsilon, at in found["minimal"].items()}, "knee": found["knee"]}
+    titled = {"control": 0, **{f"{epsilon} dB": at for epsilon, at in found["minimal"].items()}}
     for title, at in titled.items():
-        if at is None:
-            table.add_row(title, *[MISSING] * 6)
-            continue
         step, epsilon = steps[at], title.removesuffix(" dB")
         least = found["possible"].get(epsilon)
         interval = MISSING if least is None else f"{min(steps[least]['rows'], step['rows'])}–{step['rows']}"

@@ -204,7 +204,7 @@ def test_a_launcher_that_starts_nothing_is_given_up(tmp_path, capsys):
 
 
 class DiesAtFirst(Start):
-    deaths = 3
+    deaths = sweep.IDLE_LAUNCHES - 1
 
     def launch(self, jobs, initial_job_idx):
         if self.deaths:

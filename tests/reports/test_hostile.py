@@ -96,7 +96,7 @@ def changed(run, **changes):
 
 
 STEP = {"rows": 1, "blended": 1, "bytes": 1, "frame_ms": 1.0, "loss": 0.0, "ws_psnr": 1.0, "lpips": None}
-SEARCH = {"rows": 1, "steps": [STEP], "minimal": {}, "knee": 9, "cpu_seconds": 1}
+SEARCH = {"rows": 1, "steps": [STEP], "minimal": {}, "cpu_seconds": 1}
 HOSTILE = {
     "a long scene": {"scene": "x" * 10_000},
     "a long variant": {"variant": "x" * 300},

@@ -38,7 +38,6 @@ def found(best: float, *, rows: str = "gaussians", each: int = 1) -> dict:
         "rows": 10_000 // each,
         "ws_psnr": best,
         "minimal": minimal,
-        "knee": 1,
         "steps": steps,
     }
     return own | {"views": ["a", "b", "c"], "seconds": 10.0, "cpu_seconds": 5.0}

@@ -67,7 +67,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     cameras = by_id(model_files.read_cameras(files["cameras"]), str(files["cameras"]))
     images = sorted(model_files.read_images(files["images"]), key=lambda image: image.id)
     by_id(((image.id, (image.name, *image.pose)) for image in images), str(files["images"]))
-    points = model_files.Points({}, colored, frozenset())
+    points = model_files.Points({}, colored)
     if "points3D" in files:
         points = model_files.read_points(files["points3D"])
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
@@ -104,8 +104,6 @@ def _reference_notes(images: list[model_files.Image], points: model_files.Points
     if absent and points.row_of:
         total = absent + int(known.sum())
         notes.append(f"{absent} of {total} observations are of points that the model does not hold; they are left out")
-    if lost := sorted(points.images - {image.id for image in images}):
-        notes.append(f"points name {len(lost)} images that the model does not hold (id {listed(lost)}); left out")
     return notes
 
 

@@ -56,7 +56,6 @@ class Points(NamedTuple):
 
     row_of: dict[int, int]  # point id -> row of the cloud
     cloud: Cloud | None
-    images: frozenset[int]  # ids of the images that see a point
 
 
 def find_file(model: Path, stem: str) -> Path | None:
@@ -121,18 +120,15 @@ def read_images(file: Path) -> Iterator[Image]:
 
 def read_points(file: Path) -> Points:
     """Read the points file."""
-    seen_by: set[int] = set()
     if file.suffix.lower() == ".txt":
         kinds, rows = (int, *[float] * 6), []
         for number, line in _lines(file):
-            values, track = line.split()[:7], line.split()[8::2]
-            rows.append(_fields(file, number, values, kinds, "ID X Y Z R G B"))
-            seen_by.update(_fields(file, number, track, (int,) * len(track), "a track of IMAGE POINT2D ..."))
+            rows.append(_fields(file, number, line.split()[:7], kinds, "ID X Y Z R G B"))
     else:
 
         def entry(cursor: _Cursor) -> tuple[Any, ...]:
             values = cursor.take("Q3d3B8x")
-            seen_by.update(cursor.array([("image", "<u4"), ("observation", "<u4")])["image"].tolist())
+            cursor.array([("image", "<u4"), ("observation", "<u4")])  # the track
             return values
 
         rows = _entries(file, entry)
@@ -140,7 +136,7 @@ def read_points(file: Path) -> Points:
     values = np.array([row[1:] for row in rows], np.float64).reshape(-1, 6)
     colors = color_bytes(whole_if_possible(values[:, 3:]), str(file))
     cloud = Cloud(torch.from_numpy(values[:, :3].copy()), colors)
-    return Points({row[0]: i for i, row in enumerate(rows)}, cloud, frozenset(seen_by))
+    return Points({row[0]: i for i, row in enumerate(rows)}, cloud)
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:

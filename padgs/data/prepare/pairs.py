@@ -49,23 +49,23 @@ def similarities(database: Path, images: Sequence[Sequence[str]], seed: int) -> 
     """Return the similarity [n, n] of panoramas, wherever they look, by features' residuals to a vocabulary (VLAD)."""
     from scipy.cluster.vq import kmeans2, vq
 
-    random = np.random.default_rng(seed)
-    features = []
+    random, count = np.random.default_rng(seed), len(images)
     with pycolmap_module().Database.open(database) as entries:
         ids = {image.name: image.image_id for image in entries.read_all_images()}
-        for group in images:
+
+        def features(group: Sequence[str]) -> np.ndarray:  # read twice: those of all panoramas may fill the memory
             found = np.concatenate([entries.read_descriptors(ids[name]).data for name in group]).astype(np.float32)
-            features.append(np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1)))  # RootSIFT
-    each = -(-_SAMPLE // len(features))
-    sample = np.concatenate([random.permutation(found)[:each] for found in features])
-    if len(sample) < _WORDS:
-        return np.zeros((len(features), len(features)))
-    words, _ = kmeans2(sample, sample[random.permutation(len(sample))[:_WORDS]], iter=10, minit="matrix")
-    signatures = np.zeros((len(features), *words.shape), np.float32)
-    for index, found in enumerate(features):
-        if len(found):
-            word, _ = vq(found, words)
-            np.add.at(signatures[index], word, found - words[word])
+            return np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1))  # RootSIFT
+
+        sample = np.concatenate([random.permutation(features(group))[: -(-_SAMPLE // count)] for group in images])
+        if len(sample) < _WORDS:
+            return np.zeros((count, count))
+        words, _ = kmeans2(sample, sample[random.permutation(len(sample))[:_WORDS]], iter=10, minit="matrix")
+        signatures = np.zeros((count, *words.shape), np.float32)
+        for index, group in enumerate(images):
+            if len(found := features(group)):
+                word, _ = vq(found, words)
+                np.add.at(signatures[index], word, found - words[word])
     signatures /= np.maximum(np.linalg.norm(signatures, axis=2, keepdims=True), 1e-9)
-    flat = signatures.reshape(len(features), -1)
+    flat = signatures.reshape(count, -1)
     return flat @ flat.T

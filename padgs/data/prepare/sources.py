@@ -1,6 +1,7 @@
 """Input of `prepare`: a folder of panoramas with masks, or a 360-degree video, checked before any work is done."""
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -53,11 +54,12 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
     installed, that the file cannot be decoded, or that its frames are no panoramas.
     """
-    written, last = 0, np.zeros(0, np.uint8)
+    written, seen = 0, set[bytes]()
     for frame in _sharpest(video, per_second, progress):
-        if np.array_equal(frame, last):  # of a still
+        digest = hashlib.sha256(frame.tobytes()).digest()
+        if digest in seen:  # of a still, or of a title that comes again
             continue
-        written, last = written + 1, frame
+        written, seen = written + 1, seen | {digest}
         Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
     if written < 2:
         what = f"{video} gives {written} different frames at {per_second:g} a second; poses need at least two"
@@ -165,7 +167,8 @@ def find_source(path: Path, mask: str) -> Source:
     if twins := [f"{name} and {by_digest[of.digest]}" for name, of in images.items() if by_digest[of.digest] != name]:
         raise DataError(f"{folder} holds images that are the same: {listed(twins)}; remove one of each pair")
     no_pose = torch.eye(4, dtype=torch.float64)
-    expected = path.parent if path.name.lower() == "images" and folder == path else path  # of masks
+    place = Path(os.path.abspath(path))  # of "." too
+    expected = place.parent if place.name.lower() == "images" and folder == path else path  # of masks
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
     capture = Capture("images", expected, folder, frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]

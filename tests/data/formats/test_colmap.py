@@ -79,7 +79,6 @@ def test_references_to_what_is_absent_are_left_out(world: World, tmp_path: Path)
     _rewrite(tmp_path, "points3D.txt", lambda text: text.replace(" 0.1\n", " 0.1 1 0 99 0\n"))
     notes = _notes(tmp_path)
     assert "6 of 18 observations are of points that the model does not hold; they are left out" in notes
-    assert "points name 1 images that the model does not hold (id 99)" in notes
     tracks = read(tmp_path).tracks()  # type: ignore[misc]
     assert tracks.frame.tolist() == list(range(6)) and tracks.pixels[0].tolist() == [1.5, 2.5]
     write_colmap_binary(world, tmp_path / "b")
