@@ -102,7 +102,7 @@ def peak_memory(device: Device = "cpu") -> dict[str, Any]:
     on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
     # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
     # reports its parent's peak.
-    kilobytes = int(_linux("/proc/self/status", "VmHWM").partition(" ")[0] or 0)
+    kilobytes = int(linux_value("/proc/self/status", "VmHWM").partition(" ")[0] or 0)
     other = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return {"peak_memory_bytes": 1024 * kilobytes or other, "peak_device_memory_bytes": on_device}
 
@@ -116,7 +116,7 @@ def machine(device: Device = "cpu") -> dict[str, Any]:
     """Return hardware, versions, code and date, which a measurement is read with."""
     gpu = torch.device(device) if torch.device(device).type == "cuda" else None
     return {
-        "cpu": _linux("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
+        "cpu": linux_value("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
         "cores": cores(),
         "threads": torch.get_num_threads(),
         "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
@@ -144,7 +144,7 @@ def commit(folder: Path | None = None) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _linux(file: str, key: str) -> str:
+def linux_value(file: str, key: str) -> str:
     """Return the first value of a key in a file of the Linux kernel; empty elsewhere."""
     try:
         lines = Path(file).read_text().splitlines()

@@ -143,6 +143,50 @@ def test_arrays_that_slurm_refuses_are_submitted_in_parts_if_that_may_help(
     )
 
 
+class Busy(Start):
+    """Slurm takes as many jobs as `limits` say, one number a submission; None: it does not answer."""
+
+    def launch(self, jobs, initial_job_idx):
+        limit = self.limits.pop(0)
+        if limit is None or len(jobs) > limit:
+            raise SubmissionRefused("QOSMaxSubmitJobPerUserLimit" if limit else "Unable to contact slurm controller")
+        self.sizes.append(len(jobs))
+        super().launch(jobs, initial_job_idx)
+
+
+def test_a_queue_that_is_full_or_silent_for_a_while_is_used_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweep, "SECONDS_BETWEEN_RETRIES", 0)
+    start = Busy(tmp_path, 1, ELSEWHERE, jobs=[[f"++seed={n}"] for n in range(9)])
+    start.limits, start.sizes = [None, None, 1, 2, 9, 9, 9], []
+    assert start.counts(4) == {"ok": 9} and start.sizes == [2, 4, 3]
+    lost = Busy(tmp_path / "2", 1, ELSEWHERE)
+    lost.limits, lost.sizes = [None] * 100, []
+    assert lost.counts() == {"refused": 3} and len(lost.limits) == 99 - sweep.RETRIES_OF_SLURM
+
+
+class Preempted(Start):
+    def end(self, number, job):
+        self.board.write(number, JobState("stopped", reason="stopped after iteration 5"))
+        assert "1 stopped" in self.multirun.line()
+        self.finish(number, job, "ok")  # Slurm has put it back into its queue
+        assert "stopped" not in self.multirun.line()
+
+
+def test_a_run_that_was_preempted_is_followed_to_its_end(tmp_path):
+    assert Preempted(tmp_path, 1, ELSEWHERE).counts() == {"ok": 3}
+
+
+class LeavesTheQueue(Start):
+    def end(self, number, job):
+        self.board.write(number, JobState("stopped", reason=sweep.LEFT_QUEUE))
+
+
+def test_jobs_that_nobody_stopped_say_why_they_did_not_begin(tmp_path, capsys):
+    start = LeavesTheQueue(tmp_path, 1, ELSEWHERE)
+    assert start.counts() == {"stopped": 3} and start.folder.exists()
+    assert capsys.readouterr().err.count("a node cannot write to run.folder") == 1
+
+
 def test_slurm_jobs_are_followed_until_the_queue_has_none_of_them(tmp_path, monkeypatch):
     answers = [None, {"7_0", "7_1", "8"}, {"7_1"}, {"8"}]  # 8 is of somebody else; Slurm does not answer at first
     monkeypatch.setattr(slurm, "queued", lambda: answers.pop(0))
@@ -329,3 +373,4 @@ def test_a_finished_slurm_job_whose_log_is_not_visible_yet_stays_finished(tmp_pa
     board.write(7, JobState("ok", "room"))
     sweep.launch(launcher, [["seed=0"], ["seed=1"]], 7, board)
     assert [board.read(number).status for number in (7, 8)] == ["ok", "stopped"]
+    assert board.read(8).reason == sweep.LEFT_QUEUE, "nobody asked for a stop"

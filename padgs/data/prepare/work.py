@@ -13,7 +13,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from padgs.clock import cores
+from padgs.checks import check, check_known
+from padgs.clock import cores, linux_value
 from padgs.data.assemble import PREPARED
 from padgs.data.capture import DataError
 from padgs.data.masks import mask_path
@@ -40,11 +41,8 @@ def threads_for(width: int, height: int) -> int:
 
 def free_memory() -> int | None:
     """Return the free memory in bytes, or None where that is not known."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            return next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):  # not Linux
-        return None
+    kilobytes = linux_value("/proc/meminfo", "MemAvailable").partition(" ")[0]
+    return 1024 * int(kilobytes) if kilobytes else None
 
 
 def refuse_full(folder: Path) -> None:
@@ -77,13 +75,9 @@ class PrepareOptions:
     threads: int = 0  # 0 = one per processor, at most 8, limited by free memory
 
     def __post_init__(self) -> None:
-        for what, name, names in (("pairs", self.pairs, PAIRS), ("mapper", self.mapper, MAPPERS)):
-            if name not in names:
-                raise DataError(f"unknown {what} {name!r}; known: {', '.join(names)}")
-        if not 0 < self.per_second <= 1000:
-            raise DataError(f"per_second is {self.per_second}; it must be above 0 and at most 1000 frames a second")
-        if self.threads < 0:
-            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for automatic")
+        check_known(self, pairs=PAIRS, mapper=MAPPERS)
+        check(self, "above 0 and at most 1000 frames a second", lambda rate: 0 < rate <= 1000, "per_second")
+        check(self, "at least 1, or 0 for automatic", lambda count: count >= 0, "threads")
 
 
 @dataclass

@@ -314,9 +314,9 @@ def test_errors_of_pycolmap_are_reported_with_a_remedy(tmp_path, monkeypatch):
 
 
 def test_bad_input_is_refused(scene, tmp_path):
-    with pytest.raises(DataError, match="unknown pairs 'some'; known: auto, exhaustive, sequential"):
+    with pytest.raises(ValueError, match="unknown pairs 'some'; known: auto, exhaustive, sequential"):
         PrepareOptions(pairs="some")
-    with pytest.raises(DataError, match="per_second"):
+    with pytest.raises(ValueError, match="per_second"):
         PrepareOptions(per_second=0.0)
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").touch()

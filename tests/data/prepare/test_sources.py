@@ -31,7 +31,7 @@ def save(path, value=100, size=(16, 32)):
     Image.fromarray(pixels).save(path)
 
 
-def test_images_masks_and_notes(tmp_path):
+def test_images_masks_and_notes(tmp_path, monkeypatch):
     for name in ("b.png", "a.png", "up stairs/ç.png"):
         save(tmp_path / "images" / name)
     mask = np.full((16, 32), 255, np.uint8)
@@ -42,6 +42,8 @@ def test_images_masks_and_notes(tmp_path):
     assert source.notes == ("mask: mask.png for every view",)
     assert source.masks["a.png"]().mean() == pytest.approx(0.75)
     inner = find_source(tmp_path / "images", "auto")  # the same, asked for by the image folder
+    monkeypatch.chdir(tmp_path / "images")
+    assert find_source(Path(), "auto").masks.keys() == inner.masks.keys() != set(), "from within"
     assert inner.fingerprint == source.fingerprint
     bare = find_source(tmp_path, "none")
     assert bare.masks == {}
@@ -216,7 +218,7 @@ def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
 
 def test_equal_frames_of_a_still_are_written_once(tmp_path, monkeypatch):
     still, moved = np.zeros((16, 32, 3), np.uint8), np.full((16, 32, 3), 9, np.uint8)
-    monkeypatch.setattr(sources, "_sharpest", lambda *_: iter([still, still, moved]))
+    monkeypatch.setattr(sources, "_sharpest", lambda *_: iter([still, still, moved, still]))
     assert extract_frames(tmp_path / "a.mp4", tmp_path, 1.0) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frame_00001.jpg", "frame_00002.jpg"]
 
