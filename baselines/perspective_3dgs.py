@@ -79,6 +79,10 @@ class Cubemap3DGSMethod(SplatMethod):
         if self.train_options.weight != "uniform":
             weight = self.train_options.weight
             raise ValueError(f"train.weight is {weight}, but perspective views have no latitude; set uniform")
+        if self.train_options.depth_weight:
+            raise ValueError(
+                "train.depth_weight is not 0, but views that are cut from panoramas have no depth map; set 0"
+            )
         for learned in ("exposures", "poses", "lens"):
             if (choice := getattr(self.train_options, learned)) != GIVEN:
                 raise ValueError(

@@ -2,14 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 from mkdocs.structure.files import File
 
 REPORTS = Path(__file__).resolve().parent.parent / "reports"
 
 
-def on_files(files: Any, config: Any) -> Any:
+def on_files(files, config):
     """Add `reports/measured` to the files of the site."""
     for path in sorted(REPORTS.glob("measured/*")):
         if path.suffix in (".md", ".png"):
@@ -18,7 +17,7 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def on_page_markdown(markdown, **_):
     """Return a page with links as they are in the site, where `measured` lies beside the pages of `docs`."""
     markdown = re.sub(r"\]\(\.\./((?:\.\./)?)reports/measured/", r"](\1measured/", markdown)
     return re.sub(r"\]\(\.\./\.\./docs/", "](../", markdown)

@@ -263,18 +263,6 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     return result
 
 
-def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
-    """Return run folder -> result for all run folders in a folder, by name, and the errors of unreadable ones."""
-    results: dict[Path, Result] = {}
-    errors: list[ResultError] = []
-    for path in sorted(folder.glob(f"*/{FILE_NAME}")):
-        try:
-            results[path.parent] = read(path)
-        except ResultError as error:
-            errors.append(error)
-    return results, errors
-
-
 def _refuse_impossible(result: Result) -> None:
     """Refuse values of the right type that no run writes; a digest is no signature."""
     if result.external.keys() - EXTERNAL or not all(isinstance(text, str) for text in result.external.values()):

@@ -135,17 +135,6 @@ def test_a_full_disk_leaves_the_old_file_and_no_litter(result, tmp_path, monkeyp
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
 
 
-def test_read_all_keeps_the_good_and_names_the_bad(result, tmp_path):
-    for name in ("b", "a", "c"):
-        (tmp_path / name).mkdir()
-        results.write(replace(result, run=name), tmp_path / name)
-    (tmp_path / "b" / "result.json").write_text("{")
-    (tmp_path / "unfinished").mkdir()
-    good, bad = results.read_all(tmp_path)
-    assert {folder.name: r.run for folder, r in good.items()} == {"a": "a", "c": "c"}
-    assert len(bad) == 1 and "b/result.json" in str(bad[0])
-
-
 def test_lines_of_a_log_that_are_being_written_are_left_for_later(tmp_path):
     assert list(results.log_lines(tmp_path)) == []
     (tmp_path / "log.jsonl").write_text('{"iteration": 1}\n{"loss": 2}\n[3]\n{"iteration": 2, "lo')

@@ -34,7 +34,7 @@ from padgs.render import Rendering
 from padgs.runs.load import LoadedRun
 from padgs.scene import View, move_origin
 
-WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16 or float32
+WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16
 DEPTH_STEPS = 1000  # of 16-bit depth, per scene scale
 # Stated explicitly: by default, players take large videos to be BT.709, and small ones to be BT.601.
 COLOURS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
@@ -94,7 +94,6 @@ def write_video(
     fps: float,
     scene_scale: float,
     depth: bool = False,
-    npy: bool = False,
     origin: Tensor | None = None,
     spherical: bool = False,
     progress: Callable[[int], None] = lambda done: None,
@@ -103,8 +102,8 @@ def write_video(
 
     `to` is an .mp4, or a folder for PNGs; files appear, and an existing video is replaced, when all frames are written.
     `depth`: also as colours in an .mp4 (bright is near), beside PNGs as distances along the rays: 16 bits,
-    `DEPTH_STEPS` per `scene_scale`, or with `npy` float32 in world units; and `depth.json`: unit, camera and pose of
-    each frame in the world of the data set, where the scene has its `origin`. `spherical`: mark an .mp4 as a panorama.
+    `DEPTH_STEPS` per `scene_scale`; and `depth.json`: unit, camera and pose of each frame in the world of the data set,
+    where the scene has its `origin`. `spherical`: mark an .mp4 as a panorama.
     `progress` is called with the number of written frames.
     """
     is_mp4 = to.suffix.lower() == ".mp4"
@@ -112,23 +111,20 @@ def write_video(
         raise ValueError(f"{to} is not an .mp4, the only video format; a folder for PNGs must have no suffix")
     if to.name.lower() == ".mp4":
         raise ValueError(f"{to} has no name before its suffix; name the video, such as {to.with_name('film.mp4')}")
-    if npy and (is_mp4 or not depth):
-        raise ValueError("--npy is about depth in numbers: add --depth and --to FOLDER")
     outputs = [to, to.with_name(f"{to.stem}-depth{to.suffix}" if is_mp4 else f"{to.name}-depth")] if depth else [to]
-    unit = 1.0 if npy else scene_scale / DEPTH_STEPS
+    unit = scene_scale / DEPTH_STEPS
     with ExitStack() as stack:
         if is_mp4:
             writers = [stack.enter_context(_mp4(path, views[0], fps, spherical)) for path in outputs]
         else:
-            texts = ("", depth_unit(to, scene_scale, npy=npy))
+            texts = ("", depth_unit(to, scene_scale))
             writers = [stack.enter_context(_folder(*each)) for each in zip(outputs, texts, strict=False)]
         for number, view in enumerate(views):
             rendering = render(view)
             writers[0](to_uint8(rendering.image))
             if depth:
-                steps = rendering.depth if npy else (rendering.depth / unit).round().clamp(0, 2**16 - 1)
-                kind = np.float32 if npy else np.uint16
-                writers[1](depth_image(rendering, scene_scale) if is_mp4 else steps.cpu().numpy().astype(kind))
+                steps = (rendering.depth / unit).round().clamp(0, 2**16 - 1).cpu().numpy().astype(np.uint16)
+                writers[1](depth_image(rendering, scene_scale) if is_mp4 else steps)
             progress(number + 1)
     if depth and not is_mp4:
         statement = {"measure": "ray", "unit": unit, "frames": _frames(views, origin)}
@@ -136,12 +132,10 @@ def write_video(
     return outputs
 
 
-def depth_unit(to: Path, scene_scale: float, *, npy: bool = False) -> str:
+def depth_unit(to: Path, scene_scale: float) -> str:
     """Return what the values of written depths mean; PNGs hold it as their description."""
     if to.suffix.lower() == ".mp4":
         return "depth: bright is near, black is empty; a folder of PNGs holds it in numbers"
-    if npy:
-        return "depth: float32, world units of the data set along the ray; 0 is empty; cameras in depth.json"
     unit = scene_scale / DEPTH_STEPS
     return (
         f"depth: one step is {unit:.6g} world units of the data set along the ray; 0 is empty, 65535 is "
@@ -164,7 +158,7 @@ def _frames(views: Sequence[View], origin: Tensor | None) -> dict[str, Any]:
 @contextmanager
 def _folder(path: Path, description: str) -> Iterator[WriteFrame]:
     path.mkdir(parents=True, exist_ok=True)
-    if stale := next((file for file in path.iterdir() if file.suffix in (".png", ".npy")), None):
+    if stale := next((file for file in path.iterdir() if file.suffix == ".png"), None):
         raise ValueError(f"{path} already holds images, such as {stale.name}; choose another folder with --to")
     numbers, info = iter(range(1, 1 << 30)), PngInfo()
     if description:
@@ -173,10 +167,7 @@ def _folder(path: Path, description: str) -> Iterator[WriteFrame]:
         draft.mkdir()
 
         def write(frame: np.ndarray) -> None:
-            if frame.dtype == np.float32:
-                np.save(draft / f"{next(numbers):05d}.npy", frame)
-            else:
-                Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png", pnginfo=info)
+            Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png", pnginfo=info)
 
         yield write
         for image in sorted(draft.iterdir()):

@@ -38,23 +38,23 @@ def track(
     """Mirror finished runs into mlflow, for example runs of a cluster."""
     from pathlib import Path
 
-    from padgs import results
+    from padgs.reports import store
+    from padgs.results import AD_HOC
     from padgs.runs.tracking import Tracker, TrackingOptions
 
     if not Path(runs).is_dir():
         raise FileNotFoundError(f"there is no folder {runs}; give the folder of the runs")
-    found, broken = results.read_all(Path(runs))
+    found, broken = store.read(Path(runs))
     for error in broken:
         show(f"left out: {error}")
     if not found:
         raise ValueError(f"no finished run is in {runs}; give the folder of the runs")
     options, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
-    for folder, result in found.items():
-        experiment = " ".join(name for name in result.experiments if name != results.AD_HOC)
+    for run in found:
+        experiment = " ".join(name for name in run.result.experiments if name != AD_HOC)
         if experiment not in trackers:
             trackers[experiment] = Tracker(options, Path(runs), experiment, show)
-        trackers[experiment].add(folder)
+        trackers[experiment].add(run.renders.parent)
         if not trackers[experiment].on:
             raise typer.Exit(1)
-    names = {result.run for result in found.values()}  # once, whatever copies there are
-    show(f"mirrored: {len(names)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")
+    show(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

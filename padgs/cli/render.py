@@ -20,7 +20,6 @@ def render(
     seconds: Annotated[float | None, typer.Option(help="length of the video; default 10, or that of the path")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
     depth: Annotated[bool, typer.Option("--depth", help="also write depth")] = False,
-    npy: Annotated[bool, typer.Option("--npy", help="also write float32 depth beside the PNGs of --to FOLDER")] = False,
     data: DataPath = None,
     rays: Rays = "exact",
     transform: Transform = "",
@@ -66,7 +65,6 @@ def render(
                 fps=fps,
                 scene_scale=found.scene.scale,
                 depth=depth,
-                npy=npy,
                 origin=found.scene.origin,
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),
@@ -74,4 +72,4 @@ def render(
     for written in outputs:
         show(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")
     if depth:
-        show(f"  {depth_unit(output, found.scene.scale, npy=npy)}")
+        show(f"  {depth_unit(output, found.scene.scale)}")

@@ -47,9 +47,7 @@ def folded(path: Path | PurePosixPath | str) -> str:
 
 
 def given_path(given: str, folder: Path) -> Path:
-    """Return the path that an option names: from the data set's folder or, where nothing is there, from the working
-    directory.
-    """
+    """Return the path that an option names: from the data set's folder, or else from the working directory."""
     inside, here = folder / given, Path(given).absolute()
     return here if here.exists() and not inside.exists() else inside
 

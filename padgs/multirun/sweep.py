@@ -162,9 +162,8 @@ class Multirun:
 
     def line(self) -> str:
         """Read the board and sum it up."""
-        # Slurm requeues what it preempts.
-        open_ones = (index for index, of in self.states.items() if not of.ended or of.status == Status.STOPPED)
-        self._follow(index for index in open_ones if self._numbers[index] >= 0)
+        is_open = {Status.WAITING, Status.RUNNING, Status.STOPPED}  # Slurm requeues what it preempts
+        self._follow(n for n, state in self.states.items() if state.status in is_open and self._numbers[n] >= 0)
         return status_line(self.before, [*self.states.values()], time.monotonic() - self._began)
 
     def close(self) -> Counter[str]:

@@ -70,7 +70,11 @@ def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhol
     """
     channels = torch.stack([channels_of(face) for face in faces]).flatten(0, 2)  # [6 S S, 5]
     pixels, weights = _corners(panorama, lens, channels.device)
-    resampled = (weights.to(channels)[:, :, None] * channels[pixels]).sum(1)  # [H W, 5]
+    # On each device the one of two indexings whose gradient is deterministic.
+    corners = (
+        channels[pixels] if channels.is_cuda else channels.index_select(0, pixels.flatten()).view(*pixels.shape, 5)
+    )
+    resampled = (weights.to(channels)[:, :, None] * corners).sum(1)  # [H W, 5]
     visible = torch.stack([face.visible for face in faces]).any(0)
     like = replace(faces[0], visible=visible, counters=summed_counters(faces, visible))
     return from_channels(resampled.view(panorama.height, panorama.width, 5), like)

@@ -230,7 +230,7 @@ class Method(ABC):
 
     def _refuse_photographs(self, scene: Scene) -> None:
         """Refuse photographs beside the panoramas of a scene if the renderer draws panoramas only."""
-        if scene.train[0].lens is not None:  # views that are cut from panoramas
+        if scene.train[0].lens is not None or not self.HAS_GAUSSIANS:  # views cut from panoramas; rays of any camera
             return
         for view in (*scene.train, *scene.test):
             try:

@@ -128,24 +128,22 @@ def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
     np.testing.assert_allclose(frame["cam_from_world"], pose.numpy(), atol=1e-6)
 
 
-@pytest.mark.parametrize("npy", [False, True])
-def test_written_depths_can_be_read_as_depth_maps(npy, tmp_path):
+def test_written_depths_can_be_read_as_depth_maps(tmp_path):
     depth = 5 * torch.rand(32, 64)
     shown = SimpleNamespace(image=SHOWN.image, depth=depth)
-    origin, options = torch.tensor([10.0, 0.0, 0.0]), {"fps": 10, "scene_scale": 2.5, "depth": True, "npy": npy}
+    origin, options = torch.tensor([10.0, 0.0, 0.0]), {"fps": 10, "scene_scale": 2.5, "depth": True}
     (tmp_path / "a.1").mkdir()  # a dot in the name of a folder begins no suffix
     write_video(tmp_path / "a.1", [VIEW], lambda view: shown, origin=origin, **options)
     stated = json.loads((tmp_path / "a.1-depth" / "depth.json").read_text())
-    assert stated["measure"] == "ray" and stated["unit"] == (1 if npy else 0.0025)
+    assert stated["measure"] == "ray" and stated["unit"] == 0.0025
     assert np.linalg.inv(stated["frames"]["00001"]["cam_from_world"])[:3, 3].tolist() == [10, 0, 0]
     found = read_depth(next((tmp_path / "a.1-depth").glob("00001.*"))) * stated["unit"]
-    np.testing.assert_allclose(found, depth, atol=0 if npy else 0.00126)
+    np.testing.assert_allclose(found, depth, atol=0.00126)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--npy",), "--npy is about depth in numbers: add --depth and --to FOLDER"),
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
         *((("--fps", value), f"--fps is {float(value)}; it must be from 0.01 to 1000") for value in BAD_NUMBERS),
         *((("--seconds", value), f"--seconds is {float(value):g}, which makes") for value in BAD_NUMBERS),

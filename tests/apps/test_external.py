@@ -31,6 +31,7 @@ from padgs.evaluation.images import to_uint8
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry.similarity import Similarity
 from padgs.methods.splats.splats import Splats
+from padgs.reports import store
 from padgs.scene import Scene
 
 TURN = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
@@ -58,7 +59,7 @@ def splats(run, tmp_path_factory) -> Path:
 
 
 def the_result(folder: Path) -> results.Result:
-    return next(iter(results.read_all(folder)[0].values()))
+    return store.read(folder)[0][0].result
 
 
 def test_gaussians_are_scored_like_a_run(run, splats, tmp_path):

@@ -8,6 +8,7 @@ from support.tiny_scene import in_other_units, squared_error, tiny_scene
 
 from padgs.baselines.egonerf import EgoNeRFMethod
 from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.geometry.camera import Pinhole
 from padgs.methods.egonerf.field import EgoNeRF, EgoNeRFOptions
 from padgs.methods.egonerf.model import EgoNeRFModel
 from padgs.render import RenderConfig
@@ -15,6 +16,7 @@ from padgs.runs.run import build_method
 from padgs.scene import Scene, View
 from padgs.training.options import Budget, TrainOptions
 
+PHOTO = Pinhole(8, 6, 5.0, 5.0, 4.0, 3.0)
 SMALL = EgoNeRFOptions(
     radial_nodes=16,
     polar_nodes=12,
@@ -154,3 +156,11 @@ def test_published_weights_of_the_variation_fall_like_the_rates():
 def test_published_training_options():
     options = composed("method=egonerf").options
     assert (options.rays, options.density_variation, options.appearance_variation) == (4096, 0.1, 0.01)
+
+
+def test_photographs_beside_panoramas_are_trained_on():
+    scene = tiny_scene()
+    first, *others = scene.train
+    photo = View("photo", first.cam_from_world, 8, 6, lambda: torch.zeros(6, 8, 3, dtype=torch.uint8), lens=PHOTO)
+    trained = method()
+    assert len([*trained.fit(replace(scene, train=(*others, photo)), Budget(2))]) == 2

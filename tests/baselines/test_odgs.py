@@ -91,6 +91,11 @@ def test_pixel_bias_shifts_the_render():
         ODGSMethod(ODGSOptions(pixel_bias=0.5), RenderConfig("ray"))
 
 
+def test_a_margin_of_an_extent_that_is_not_used_is_refused():
+    with pytest.raises(ValueError, match=r"extent_margin=100\.0 is added to the extent, .* length_unit=nearest_camera"):
+        ODGSMethod(ODGSOptions(extent_margin=100.0, length_unit="nearest_camera"), RenderConfig())
+
+
 def test_extent_margin_clones_instead_of_splitting():
     for margin, expected in ((0.0, "cloned 0, split 1"), (100.0, "cloned 1, split 0")):
         model = model_of(

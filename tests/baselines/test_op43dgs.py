@@ -13,6 +13,7 @@ from support.tiny_scene import in_other_units, squared_error, tiny_scene
 
 from padgs import results
 from padgs.baselines.op43dgs import OP43DGSMethod, OP43DGSOptions
+from padgs.reports import store
 from padgs.runs import run as pipeline
 from padgs.scene import Scene, View
 from padgs.training.options import Budget
@@ -76,4 +77,4 @@ def test_far_away_the_release_ends_as_oom_with_the_numbers(tmp_path, monkeypatch
     instances, needed = (int(number.replace(",", "")) for number in match.groups())
     assert needed == 24 * instances > 60_000
     assert run("op43dgs", far, tmp_path, monkeypatch).status == "ok"
-    assert {result.status for result in results.read_all(tmp_path)[0].values()} == {"ok", "oom"}, "the sweep goes on"
+    assert {run.result.status for run in store.read(tmp_path)[0]} == {"ok", "oom"}, "the sweep goes on"

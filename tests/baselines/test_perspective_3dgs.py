@@ -92,6 +92,12 @@ def test_learns_whole_panoramas_from_their_parts(name):
 
 
 @each_method
+def test_a_weight_of_depth_is_refused(name):
+    with pytest.raises(ValueError, match="train.depth_weight is not 0, but views that are cut from panoramas have no"):
+        METHOD[name](train=replace(METHOD[name].TRAIN, depth_weight=0.1))
+
+
+@each_method
 def test_a_weight_of_latitudes_is_refused(name):
     with pytest.raises(ValueError, match="train.weight is solid_angle, but perspective views have no latitude"):
         METHOD[name](train=TrainOptions(weight="solid_angle"))

@@ -18,6 +18,7 @@ from support.tiny_run import SMALLEST, finish
 from padgs import results
 from padgs.multirun.job import exit_on_errors
 from padgs.multirun.overrides import lenient
+from padgs.reports import store
 from padgs.runs import checkpoint
 from padgs.training.health import Failure
 
@@ -60,7 +61,7 @@ def wait_for_new_checkpoint(folder: Path, before: bytes, process: subprocess.Pop
 
 def same_end(one: Path, other: Path) -> None:
     """Assert that metrics, checkpoint and log of the only run in each folder are equal, bit by bit."""
-    (mine,), (theirs,) = results.read_all(one)[0].values(), results.read_all(other)[0].values()
+    mine, theirs = (store.read(folder)[0][0].result for folder in (one, other))
     assert mine.status == "ok"
     assert (mine.run, mine.scores, mine.counts) == (theirs.run, theirs.scores, theirs.counts)
     first, second = (checkpoint.load(folder / mine.run / "checkpoint") for folder in (one, other))

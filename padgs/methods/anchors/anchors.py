@@ -7,7 +7,7 @@ are compared by cells, never by floating-point positions.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,6 +25,7 @@ from padgs.training.optimizer import load_rows
 OMEGA_INPUTS = ("sin2", "cos")
 DISTANCE_UNITS = ("scene", "world")
 MOST_CELLS = 2**53  # from the origin; float64, which rounds positions to cells, counts so far
+LEAST_MEAN = 0.1  # length of a mean of unit vectors that has a direction
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
 
 
@@ -93,6 +94,7 @@ class PaDGS(nn.Module):
         voxel_size: spacing of the grid that anchors live on, world units.
         scene_scale: `Scene.scale`, world units.
         unit: world units of the log-scales; a power of two, so that worlds that differ by one train alike, bit by bit.
+        axis: mean polar axis of the training panoramas, for cameras that have none of their own; None: their y axis.
     """
 
     positions: Tensor
@@ -106,12 +108,14 @@ class PaDGS(nn.Module):
         voxel_size: float,
         scene_scale: float = 1.0,
         unit: float = 1.0,
+        axis: Sequence[float] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         """Build an untrained model: Gaussians at their anchors [A, 3], log-scales [A, 6], random networks."""
         super().__init__()
         count = len(positions)
         self.options, self.voxel_size, self.scene_scale, self.unit = options, voxel_size, scene_scale, unit
+        self.axis = axis
         self.register_buffer("positions", positions)
         self.features = nn.Parameter(positions.new_zeros(count, options.features))
         self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
@@ -134,6 +138,7 @@ class PaDGS(nn.Module):
             voxel_size=voxel_size,
             scene_scale=scene.scale,
             unit=unit,
+            axis=mean_axis(scene),
             generator=torch.Generator().manual_seed(seed),
         )
 
@@ -163,6 +168,8 @@ class PaDGS(nn.Module):
         distance = torch.sqrt((ray * ray).sum(-1) + (TINY * unit) ** 2)
         direction = ray / distance[:, None]
         axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
+        if view.camera.kind != "panorama" and self.axis is not None and self.options.omega_axis == "camera_y":
+            axis = self.positions.new_tensor(self.axis)  # as panoramas of that place, whatever way the camera is turned
         return direction, distance / unit, distortion(direction, axis)
 
     def decode(self, view: View, capacity: int | None = None) -> Decoded:
@@ -186,6 +193,12 @@ class PaDGS(nn.Module):
         attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
         seen = torch.cat(seen, dim=-1)
         return SeenAnchors(self.features, seen, self.positions / self.unit, self.offsets, self.log_scales, attenuation)
+
+
+def mean_axis(scene: Scene) -> list[float] | None:
+    """Return the mean polar axis [3] of the training panoramas, a unit vector in the world; None for opposite ones."""
+    mean = torch.stack([view.cam_from_world[1, :3].double() for view in scene.train if view.lens is None]).mean(0)
+    return (mean / mean.norm()).tolist() if mean.norm() > LEAST_MEAN else None
 
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:

@@ -24,7 +24,7 @@ from padgs.training.options import AUTO, Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS, Constant, LogLinear, ParameterGroup
 
 OFFSET_RATE_UNITS = ("anchor", "world")
-LENGTHS = ("voxel_size", "scene_scale", "unit")  # attributes of the anchors in a state
+STATED = ("voxel_size", "scene_scale", "unit", "axis")  # attributes of the anchors in a state
 HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
 
 
@@ -150,7 +150,7 @@ class AnchorModel:
         """Return parameters, growth statistics and random state; not copies."""
         tensors = {f"growth/{name}": values for name, values in self.growth.statistics.items()}
         tensors["random/growth"] = self.growth.generator.get_state()
-        return State(self.anchors.state_dict() | tensors, {name: getattr(self.anchors, name) for name in LENGTHS})
+        return State(self.anchors.state_dict() | tensors, {name: getattr(self.anchors, name) for name in STATED})
 
     def load_state(self, state: State) -> None:
         self.load_model(state)
@@ -161,7 +161,7 @@ class AnchorModel:
     def load_model(self, state: State) -> None:
         """Load anchors and networks only; growth starts anew."""
         self.anchors.load(state.tensors)
-        for name in LENGTHS:
+        for name in STATED:
             setattr(self.anchors, name, state.values[name])
         self.growth.reset_statistics()
 
@@ -210,8 +210,8 @@ class PaDGSMethod(Method):
     def restore(self, state: State) -> AnchorModel:
         stored = state.of_model()
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
-        lengths = {name: stored.values[name] for name in LENGTHS}
-        return self._model_of(PaDGS(positions, log_scales, self.options, **lengths), math.nan, PUBLISHED_ITERATIONS)
+        stated = {name: stored.values[name] for name in STATED}
+        return self._model_of(PaDGS(positions, log_scales, self.options, **stated), math.nan, PUBLISHED_ITERATIONS)
 
     def _model_of(self, anchors: PaDGS, extent: float, iterations: int) -> AnchorModel:
         growth = self.options.for_run(iterations)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.tiny_scene import tiny_scene
 
 from padgs.geometry.camera import perspective
 from padgs.methods.anchors import anchors
@@ -329,3 +330,17 @@ def test_invalid_clouds_are_refused():
         anchors.anchors_from_points(torch.tensor([[0.0, 0, 0], [0, float("nan"), 0]]), 0.1)
     with pytest.raises(ValueError, match="voxel_size is 1e-18, but points are 2 world units from the origin"):
         anchors.anchors_from_points(torch.tensor([[0.0, -2, 0]]), 1e-18)
+
+
+def test_other_cameras_see_the_distortion_of_panoramas_of_their_place():
+    """A pinhole that looks down sees at its nadir what a level panorama sees there (Eq. 12)."""
+    positions = torch.tensor([[0.0, 2.0, 0.1], [0.5, 0.0, 1.0], [1.0, -1.0, 0.0]])
+    model = anchors.PaDGS(positions, torch.zeros(3, 6), voxel_size=0.1, axis=[0.0, 1.0, 0.0])
+    level, down = torch.eye(4), torch.eye(4)
+    down[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    panorama, pinhole = View("p", level, 16, 8), View("q", down, 8, 8, lens=perspective(8, 8, 90.0))
+    expected = model.seen_from(panorama)[2]
+    assert expected[0] > 0.99 and torch.allclose(model.seen_from(pinhole)[2], expected)
+    assert not torch.allclose(model.seen_from(replace(pinhole, lens=None, width=16))[2], expected), "tilted panorama"
+    turned = anchors.mean_axis(tiny_scene())
+    assert turned is not None and math.hypot(*turned) == pytest.approx(1)

@@ -25,6 +25,7 @@ RENDERINGS = {
     "tangent": ("tangent", "panorama", {}),
     "ray": ("ray", "panorama", {"near": 0.05}),
     "pinhole": ("pinhole", "pinhole", {}),
+    "cube map": ("pinhole", "panorama", {"cubemap": True}),
     "erp, hybrid": ("erp", "panorama", {"blending": "hybrid", "core_size": 8}),
     "ray, hybrid": ("ray", "panorama", {"blending": "hybrid", "core_size": 3}),
     "ray in a pinhole": ("ray", "pinhole", {}),
