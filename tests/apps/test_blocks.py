@@ -215,7 +215,7 @@ def test_the_source_is_found_through_links(source, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
     Image.new("L", (32, 16), 255).save("elsewhere/all.png")
-    shutil.move("rooms/points.ply", "elsewhere/lidar.ply")
+    shutil.move("rooms/sparse_pc.ply", "elsewhere/lidar.ply")
     settings = ["--blocks", "2", "--to", "link/parts", "--mask", "elsewhere/all.png", "--points", "elsewhere/lidar.ply"]
     done = CliRunner().invoke(app, ["split", "rooms", *settings])
     assert done.exit_code == 0, done.output

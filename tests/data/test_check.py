@@ -162,8 +162,8 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         bad.exit_code == 1 and "PROBLEM" in bad.output and "pano_02.png" in bad.output and "1 problem(s)" in bad.output
     )
     assert run(app, ["check", str(tmp_path / "absent"), "--overlay", "none"]).exit_code == 1
-    assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).stderr
-    assert "unknown data.cameras 'x'" in run(app, ["check", str(folder), "--cameras", "x"]).stderr
+    assert "unknown --split 'x'" in run(app, ["check", str(folder), "--split", "x"]).stderr
+    assert "unknown --cameras 'x'" in run(app, ["check", str(folder), "--cameras", "x"]).stderr
 
 
 def test_images_that_are_left_out_are_no_problem(world: World, tmp_path: Path) -> None:

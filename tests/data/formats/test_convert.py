@@ -192,7 +192,7 @@ def test_names_with_outer_spaces(name: str, to: str, world: World, tmp_path: Pat
         file.unlink()
     if to != "transforms":
         with pytest.raises(DataError, match="has a line break, and a list has one name a line; rename the image"):
-            convert(tmp_path / "in", tmp_path / "out 2", to, options=DataOptions(test_every=2))
+            convert(tmp_path / "in", tmp_path / "out 2", to, options=DataOptions(split="every", test_every=2))
 
 
 def test_convert_refuses_invalid_calls(world: World, tmp_path: Path, monkeypatch) -> None:
