@@ -232,7 +232,7 @@ class _Builder:
 
     @property
     def _direction(self) -> bool | None:
-        """Whether a higher first measure is better; None if neither end is best."""
+        """Return whether a higher first measure is better; None if neither end is best."""
         return self.measures[0].column.higher_is_better
 
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:

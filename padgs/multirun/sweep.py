@@ -114,8 +114,8 @@ class Multirun:
         """Launch the missing jobs, all or some at a time; if stopped from outside, running jobs write checkpoints."""
         if self.before and self.jobs:
             self._say(self.line())
-        waiting, attempts, launched, idle, retries = list(self.states), Counter[int](), 0, 0, 0
-        most = batch_size or len(waiting)
+        waiting, most, retries = list(self.states), batch_size or len(self.states), 0
+        attempts, launched, idle = Counter[int](), 0, 0
         try:
             self.board.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

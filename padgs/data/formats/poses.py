@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from padgs.data.capture import FARTHEST, DataError
-from padgs.gaussians import rotation_matrices
 
 REMEDY = "remove the image or compute its pose again"
 TOLERANCE = 1e-3  # of R R^T - I; accepts files with four digits, refuses scaled or sheared matrices
@@ -71,7 +70,9 @@ def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     length = _refuse_zeros(quaternion, where).norm().item()
     if abs(length - 1) > 0.01:
         raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1: divide it by that")
-    return rotation_matrices(quaternion)
+    from scipy.spatial.transform import Rotation
+
+    return torch.from_numpy(Rotation.from_quat(quaternion.roll(-1).numpy()).as_matrix())
 
 
 def rotation_from_vector(vector: Tensor, where: str) -> Tensor:

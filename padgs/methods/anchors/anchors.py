@@ -25,7 +25,6 @@ from padgs.training.optimizer import load_rows
 OMEGA_INPUTS = ("sin2", "cos")
 DISTANCE_UNITS = ("scene", "world")
 MOST_CELLS = 2**53  # from the origin; float64, which rounds positions to cells, counts so far
-LEAST_MEAN = 0.1  # length of a mean of unit vectors that has a direction
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
 
 
@@ -198,7 +197,7 @@ class PaDGS(nn.Module):
 def mean_axis(scene: Scene) -> list[float] | None:
     """Return the mean polar axis [3] of the training panoramas, a unit vector in the world; None for opposite ones."""
     mean = torch.stack([view.cam_from_world[1, :3].double() for view in scene.train if view.lens is None]).mean(0)
-    return (mean / mean.norm()).tolist() if mean.norm() > LEAST_MEAN else None
+    return (mean / mean.norm()).tolist() if mean.norm() > 0.1 else None
 
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,15 +66,11 @@ def test_a_misspelt_camera_is_refused_before_any_work(scene, tmp_path, monkeypat
     [
         ("", PrepareOptions(known=KnownLength(gps=True)), "--gps: 0 of 6 images have a GPS position"),
         ("", PrepareOptions(per_second=5.0), "--per-second 5: .* is no video; leave it out"),
-        ("", PrepareOptions(mapper="global"), "has no global mapper; update it, or leave out --mapper"),
         ("v.mp4", PrepareOptions(known=KnownLength(gps=True)), "--gps: frames of a video have no GPS"),
         ("v.mp4", PrepareOptions(mask="inverted"), "a video has no masks of its own; give their path"),
     ],
 )
-def test_options_that_the_input_or_the_installation_lacks_are_refused_before_any_work(
-    scene, tmp_path, monkeypatch, name, options, message
-):
-    monkeypatch.setattr(sfm, "pycolmap_module", lambda: SimpleNamespace(__version__="3.0"))
+def test_options_that_the_input_lacks_are_refused_before_any_work(scene, tmp_path, monkeypatch, name, options, message):
     for module, work_of in ((sfm, "extract_features"), (pipeline, "extract_frames")):
         monkeypatch.setattr(module, work_of, None)
     source = tmp_path / name if name else scene[1]
