@@ -54,6 +54,7 @@ def track(
         experiment = " ".join(name for name in run.result.experiments if name != AD_HOC)
         if experiment not in trackers:
             trackers[experiment] = Tracker(options, Path(runs), experiment, show)
+        assert run.renders is not None, "read from a folder"
         trackers[experiment].add(run.renders.parent)
         if not trackers[experiment].on:
             raise typer.Exit(1)

@@ -190,8 +190,7 @@ def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]
 
 def _has_log(runs: DataFrame) -> Series:
     """Return which runs have a log that reaches their last iteration."""
-    ends = [log["iteration"][-1] if log["iteration"] else math.nan for log in runs["log"]]
-    return runs["iterations_done"] == ends
+    return runs["iterations_done"] == [log["iteration"][-1] if log["iteration"] else math.nan for log in runs["log"]]
 
 
 def without_dips(seconds: Sequence[float], psnr: Sequence[float]) -> tuple[list[float], list[float]]:
