@@ -83,7 +83,7 @@ def split_frames(
 def _refuse_every(every: int, decides: str) -> None:
     if every != EVERY:
         raise DataError(
-            f"data.test_every={every} changes nothing, because {decides} decides; leave it out, or set data.split=every"
+            f"data.test_every={every} changes nothing beside {decides}; leave it out, or set data.split=every"
         )
 
 
