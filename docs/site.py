@@ -11,9 +11,8 @@ REPORTS = Path(__file__).resolve().parent.parent / "reports"
 def on_files(files, config):
     """Add `reports/measured` to the files of the site."""
     for path in sorted(REPORTS.glob("measured/*")):
-        if path.suffix in (".md", ".png"):
-            name = path.relative_to(REPORTS).as_posix()
-            files.append(File(name, str(REPORTS), config.site_dir, config.use_directory_urls))
+        if path.suffix in (".md", ".png", ".json"):
+            files.append(File(f"measured/{path.name}", str(REPORTS), config.site_dir, config.use_directory_urls))
     return files
 
 

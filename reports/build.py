@@ -50,6 +50,7 @@ class _Builder:
             own |= {of.name.rpartition("/")[2]: of for of in measures if of.name.startswith(self.request.protocol)}
             measures = [own.get(n) or quantity(n, self.request.protocol, run_set.runs) for n in self.request.metrics]
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
+        self.direction = self.measures[0].column.higher_is_better if self.measures else None
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
         self.unranked: list[Mapping[str, tuple[str, str]]] = []  # presets that are not ranked, of each block
 
@@ -89,7 +90,7 @@ class _Builder:
         if any(place.seen for place in there):
             notes.append(SEEN_NOTE)
         notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference])]
-        if self.spec.by_rank and self._direction is not None:
+        if self.spec.by_rank and self.direction is not None:
             notes.append(RANKS.format(self.measures[0].column.title))
         notes += self.spec.notes
         return Table(self.name, self.spec.title, self.spec.corner, self._columns(), (*blocks, *single), tuple(notes))
@@ -145,7 +146,7 @@ class _Builder:
         return f"padgs/{value}" if self.spec.rows == "variant" else methods.published_as(value)
 
     def _columns(self) -> tuple[Column, ...]:
-        found = [Column("rank", 0)] if self.spec.by_rank and self._direction is not None else []
+        found = [Column("rank", 0)] if self.spec.by_rank and self.direction is not None else []
         for measure in self.measures:
             ours = measure.column
             found.append(ours)
@@ -230,22 +231,17 @@ class _Builder:
             heading = f"{measure.column.heading}, {published.TITLES[dataset]}"
             yield Block(heading, tuple(rows), own_columns=tuple(shown), across=across)
 
-    @property
-    def _direction(self) -> bool | None:
-        """Return whether a higher first measure is better; None if neither end is best."""
-        return self.measures[0].column.higher_is_better
-
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
         """Return a row for each setting, the best first, those without a number last."""
         every = [(one.title, one_setting(one.runs, f"{where}, {one.title}")) for one in settings(runs)]
         found = [(title, over_seeds(own, self.measures)) for title, own in every]
-        sign = -1.0 if self._direction else 1.0
+        sign = -1.0 if self.direction else 1.0
         found.sort(key=lambda row: (row[1][0].value is None, sign * (row[1][0].value or 0.0)))
         cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
         separable = not any(map(is_few, cells.values()))
         shared = places(cells, self.measures[0].column) if separable else []
         ranks = {i: Cell(1 + sum(map(len, shared[:place])), count=0) for place, rows in enumerate(shared) for i in rows}
-        first = [() if self._direction is None else (ranks.get(i, Cell()),) for i in range(len(found))]
+        first = [() if self.direction is None else (ranks.get(i, Cell()),) for i in range(len(found))]
         return tuple(Row(title, (*rank, *row)) for rank, (title, row) in zip(first, found, strict=True))
 
     def _each_run(self, runs: DataFrame) -> Iterator[Row]:

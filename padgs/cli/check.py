@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.errors import Cameras, Depth, Format, Images, Mask, Points, Split, show
+from padgs.cli.errors import OF_DATA, Cameras, Depth, Format, Images, Mask, Points, Split, as_options, show
 
 if TYPE_CHECKING:
     from padgs.data.check import Report
@@ -42,7 +43,7 @@ def check(
             overlay=None if overlay == "none" else Path(overlay) if overlay else overlay_path(Path(path)),
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )
-    end_with(report)
+    end_with(report, OF_DATA)
 
 
 def overlay_path(data: Path) -> Path:
@@ -53,9 +54,9 @@ def overlay_path(data: Path) -> Path:
     return (folder if os.access(folder, os.W_OK) else Path()) / OVERLAY
 
 
-def end_with(report: Report) -> NoReturn:
-    """Print the report; exit code 1 if there are problems."""
-    show("\n".join(lines(report)))
+def end_with(report: Report, names: Iterable[str]) -> NoReturn:
+    """Print the report, in which options have these names; exit code 1 if there are problems."""
+    show(as_options("\n".join(lines(report)), names))
     raise typer.Exit(1 if report.problems else 0)
 
 

@@ -4,7 +4,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from inspect import signature
@@ -57,7 +57,8 @@ def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
         except (typer.Exit, BrokenPipeError):  # typer ends in silence where the reader of the output has ended
             raise
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            show(f"error: {_as_options(_message(error, **options), options)}", sys.stderr)
+            names = [name for name, value in options.items() if isinstance(value, str)]
+            show(f"error: {as_options(_message(error, **options), names)}", sys.stderr)
             raise typer.Exit(1) from error
 
     return wrapped
@@ -85,13 +86,13 @@ def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) 
     return str(error) or "out of memory"
 
 
-def _as_options(message: str, options: Mapping[str, Any]) -> str:
-    """Return a message with the options of a command instead of the keys of a run that mean the same.
+def as_options(message: str, names: Iterable[str]) -> str:
+    """Return a message with options of these names instead of the keys of a run that mean the same.
 
-    >>> _as_options("set data.mask=inverted, or data.width=512", {"mask": "auto"})
+    >>> as_options("set data.mask=inverted, or data.width=512", ["mask"])
     'set --mask inverted, or data.width=512'
     """
-    known = "|".join(name for name in OF_DATA if name in options) or "(?!)"
+    known = "|".join(name for name in OF_DATA if name in {*names}) or "(?!)"
     return re.sub(rf"data\.({known})\b(=?)", lambda found: f"--{found[1]}{' ' * bool(found[2])}", message)
 
 

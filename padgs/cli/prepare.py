@@ -77,7 +77,7 @@ def prepare(
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)
     for note in (*result.notes, spent) if spent else result.notes:
         show(f"  {note}")
-    end_with(report)
+    end_with(report, ["mask"])
 
 
 @contextmanager

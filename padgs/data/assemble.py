@@ -26,9 +26,10 @@ from padgs.data.capture import (
     view_name,
 )
 from padgs.data.cloud import initial_cloud
+from padgs.data.depths import FOLDERS as DEPTH_FOLDERS
 from padgs.data.depths import with_depths
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, notes_on
-from padgs.data.masks import find_masks, masks_beside
+from padgs.data.masks import find_masks, is_of_masks, masks_beside
 from padgs.data.metres import unit_note
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage, cache_root
@@ -230,12 +231,12 @@ def found_images(capture: Capture) -> Capture:
         whole, *without = spellings(file)
         for key in (whole, *without[:1]):
             meant.setdefault(key.casefold(), set()).add(file)
-        for key in without:
+        for key in without if capture.format == "metashape" and not _is_beside(file) else ():
             ends.setdefault(key.casefold(), set()).add(file)
     found = {}  # stated name -> file
     for name in (frame.name for frame in capture.frames if frame.name not in there):
         files = next((meant[key] for key in spellings(name.casefold()) if key in meant), set())
-        if not files and not there:  # labels of a program that does not state the folders of its photographs
+        if not files and not there:  # labels, which state no folder
             files = next((ends[key] for key in [*spellings(name.casefold())][:2] if key in ends), set())
         if len(files) > 1:
             way_out = "remove all but one, set data.images to its folder, or name it with folder and extension"
@@ -266,6 +267,11 @@ def found_images(capture: Capture) -> Capture:
     return replace(capture, image_folder=folder, frames=tuple(frames), split=split, notes=(*capture.notes, note))
 
 
+def _is_beside(file: str) -> bool:
+    """Return whether a file is by its folder a mask or a depth map, and no photograph."""
+    return is_of_masks(file) or bool({*PurePosixPath(file).parts[:-1]} & {*DEPTH_FOLDERS})
+
+
 def _without_unlisted(capture: Capture, options: DataOptions) -> Capture:
     """Leave out frames without an image, with a note, if they are in neither list of views."""
     names, there = [frame.name for frame in capture.frames], [frame.image.is_file() for frame in capture.frames]
@@ -286,7 +292,8 @@ def _refuse_missing(capture: Capture) -> None:
     unreadable = next((name for name in image_names(capture.image_folder) if name in absent), None)
     remedy = "set data.images to the folder that holds them, or name the others in train.txt and test.txt"
     last_names = {PurePosixPath(name).stem for name in absent}
-    elsewhere = next((name for name in image_names(capture.folder) if PurePosixPath(name).stem in last_names), None)
+    photographs = [name for name in image_names(capture.folder) if not _is_beside(name)]
+    elsewhere = next((name for name in photographs if PurePosixPath(name).stem in last_names), None)
     above = [image_folder(folder, None) for folder in list(capture.folder.absolute().parents)[:3]]
     if outside := next((folder for folder in above if (folder / absent[0]).is_file()), None):
         remedy = f"set data.images to {os.path.relpath(outside, capture.folder)}, which holds {absent[0]}"

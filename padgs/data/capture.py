@@ -196,8 +196,8 @@ class DataSettings:
 
     dataset: str | None = None  # roam360 | ricoh360 | omniblender | ob3d | tartanair: defines mask, size and source
     width: int | None = None  # panoramas are reduced to this width by an area filter; None = as stored
-    images: str | None = None  # image folder, relative to the data set's; None = search
-    points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative to the data set's folder
+    images: str | None = None  # image folder, relative to the data set's or to the working folder; None = search
+    points: str = "auto"  # auto | random | a PLY, LAS, LAZ or E57 file, relative as `images`
     mask: str = "auto"  # auto | none | inverted (255 = ignore) | rows:959/1024 | [inverted:] a file or folder
     depth: str = "auto"  # auto: depth maps that the format names, or in depths/ with depth.json | none
     cameras: str = "all"  # all | panoramas: leave out photographs of other cameras

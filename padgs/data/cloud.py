@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, first_of, refuse_special
+from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, first_of, given_path, refuse_special
 from padgs.files import atomic_path
 from padgs.geometry.harmonics import DC
 
@@ -160,7 +160,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
     """
     notes: tuple[str, ...] = ()
     cloud, model = capture.cloud, f"the {capture.format} model in {capture.folder}"
-    where = model if source in NO_FILE else str(capture.folder / source)  # read with the capture
+    where = model if source in NO_FILE else str(given_path(source, capture.folder))  # read with the capture
     if source == "random" or cloud is None:
         cloud = random_cloud(torch.stack([frame.cam_from_world for frame in capture.frames]))
         why = "data.points=random" if source == "random" else f"{capture.format} holds none; set data.points to a file"

@@ -129,8 +129,10 @@ class Multirun:
             error = self._launch(launcher, [self.jobs[index] for index in batch], launched)
             launched += len(batch)
             self._follow(batch)
-            if isinstance(error, SubmissionRefused) and NO_ANSWER.search(str(error)) and retries < RETRIES_OF_SLURM:
+            is_silent = isinstance(error, SubmissionRefused) and NO_ANSWER.search(str(error))
+            if is_silent and retries < RETRIES_OF_SLURM and not self.board.stop_requested():
                 waiting, retries = batch + waiting, retries + 1
+                self._say(f"{error}; tried again in {SECONDS_BETWEEN_RETRIES:g} s")
                 time.sleep(SECONDS_BETWEEN_RETRIES)
                 continue
             if isinstance(error, SubmissionRefused):
@@ -149,9 +151,10 @@ class Multirun:
             for index in lost:
                 is_refused = self._in_process or (error and self.states[index].status == Status.WAITING)  # none began
                 status = Status.REFUSED if is_refused else Status.KILLED
-                began = self.states[index].status != Status.WAITING
+                began = self._in_process or self.states[index].status != Status.WAITING
                 ended = "a job ended without a status" if began else "no job began"
                 why = f"look for lack of memory or time, or a full disk, in its output in {self.board.folder}"
+                why = f"check the free space in {self.runs}" if self._in_process else why
                 reason = f"{ended}: {error or why}"
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]

@@ -1,6 +1,5 @@
 """The configuration of a run. Its keys are the fields of dataclasses; the files in `conf/` only override defaults."""
 
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -279,8 +278,8 @@ def gpus_for(device: str) -> int:
     return int(device == "cuda" or (device == "auto" and torch.cuda.is_available()))
 
 
-def choose_device(name: str, render: RenderConfig) -> torch.device:
-    """Return the device for `run.device`; auto: a GPU that can render these settings (else a warning), or the CPU."""
+def choose_device(name: str, render: RenderConfig, *, strict: bool = False) -> torch.device:
+    """Return the device for `run.device`; auto: a GPU that can render, or the CPU (`strict`: if there is none)."""
     if (name == "cuda" or render.backend == "cuda") and not torch.cuda.is_available():
         why = "torch finds no GPU with a working driver" if torch.version.cuda else "this torch is built without CUDA"
         wish, way_out = ("run.device", "cpu or auto") if name == "cuda" else ("render.backend", "auto, cpu or torch")
@@ -299,10 +298,8 @@ def choose_device(name: str, render: RenderConfig) -> torch.device:
     try:
         cuda.require(gpu)
     except (OSError, RuntimeError) as error:
-        if os.environ.get("SLURM_JOB_GPUS"):  # which others wait for
-            raise ValueError(
-                f"this job of Slurm has a GPU, which is not used: {error}; or set run.device=cpu"
-            ) from error
+        if strict:
+            raise ValueError(f"a GPU is here, but cannot be used: {error}; or set run.device=cpu") from error
         warnings.warn(f"a GPU is here, but the CPU is used: {error}", stacklevel=2)
         return torch.device("cpu")
     return gpu

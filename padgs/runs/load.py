@@ -174,7 +174,9 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         run = {"configuration": config_hash(values)}  # the data are not read
         source, above = values["data"], (Path(), *store.path.absolute().parents)  # training began in one of these
         source["path"] = _found(source["path"], above) if data_path is None else str(data_path)
-        source |= {key: _found(source[key], (Path(source["path"] or ""), *above)) for key in ("points", "mask")}
+        source |= {
+            key: _found(source[key], (Path(source["path"] or ""), *above)) for key in ("points", "mask", "images")
+        }
         values["run"]["device"] = device
         if values["render"]["backend"] in missing_backends(device):
             values["render"]["backend"] = "auto"

@@ -6,6 +6,7 @@ A run that was interrupted resumes from its checkpoint; a finished run is shown 
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -161,7 +162,8 @@ def start(config: RunConfig) -> torch.device:
     if config.run.threads_per_job is not None:
         torch.set_num_threads(config.run.threads_per_job)
     torch.manual_seed(config.seed)
-    device = choose_device(config.run.device, config.render)
+    strict = "SLURM_JOB_GPUS" in os.environ  # others wait for a GPU that this job of Slurm would not use
+    device = choose_device(config.run.device, config.render, strict=strict)
     clock.reset_peak_memory(device)
     return device
 

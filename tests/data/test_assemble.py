@@ -374,3 +374,19 @@ def test_two_cameras_may_be_reduced_to_one_size(folder: Path) -> None:
     assert images.read_text() != text
     sizes = [(frame.width, frame.height) for frame in read(folder).frames]
     assert {*sizes} == {(64, 32), (128, 64)} and {view.width for view in load(folder).train} == {64}
+
+
+@pytest.mark.parametrize("place", ["segmentation", "thumbs", "images/small"])
+def test_images_of_the_same_names_in_other_folders_are_not_taken(place: str, folder: Path) -> None:
+    (folder / place).mkdir(parents=True)
+    for path in [*(folder / "images").glob("*.png")]:
+        path.rename(folder / place / path.name)
+    with pytest.raises(DataError, match="6 of 6 poses have no image .* has the name of one: set data.images"):
+        load(folder)
+
+
+def test_a_mask_is_not_proposed_for_a_missing_photograph(folder: Path) -> None:
+    (folder / "masks").mkdir()
+    (folder / "images/pano_02.png").rename(folder / "masks/pano_02.png")
+    with pytest.raises(DataError, match="1 of 6 poses have no image .*: pano_02.png; set data.images to the folder"):
+        load(folder)

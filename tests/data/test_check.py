@@ -155,7 +155,7 @@ def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert run(app, ["check", str(folder)]).exit_code == 0
     assert (folder / "check.png").is_file() and not (tmp_path / "check.png").exists()
     chosen = run(app, ["check", str(folder), "--points", "random", "--overlay", "none"])
-    assert "100000 random points around the cameras (data.points=random)" in chosen.output
+    assert "100000 random points around the cameras (--points random)" in chosen.output
     (folder / "images/pano_02.png").unlink()
     bad = run(app, ["check", str(folder), "--overlay", "none"])
     assert (

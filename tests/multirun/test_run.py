@@ -15,7 +15,6 @@ import torch
 from hydra.errors import HydraException
 from support.tiny_run import SMALLEST, finish
 
-from padgs import results
 from padgs.multirun.job import exit_on_errors
 from padgs.multirun.overrides import lenient
 from padgs.reports import store
@@ -98,8 +97,8 @@ def test_the_ablation_is_one_command_and_its_table_another(start, tmp_path, cach
     quick = [argument for argument in TINY if not argument.startswith("train.iterations")]
     code, out, error = finish(start("+experiment=ablation", *quick, "train.iterations=30"))
     assert code == 0, error
-    found, broken = results.read_all(tmp_path / "runs")
-    variants = {result.variant for result in found.values()}
+    found, broken = store.read(tmp_path / "runs")
+    variants = {run.result.variant for run in found}
     assert variants == {"baseline", "dagd", "dagd_daom_no_m", "full"} and not broken
     report = [sys.executable, "-m", "padgs.cli.app", "report", "table3"]
     done = subprocess.run(

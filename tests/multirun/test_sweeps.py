@@ -11,10 +11,10 @@ import pytest
 from omegaconf import OmegaConf
 from support.tiny_run import SMALLEST, finish
 
-from padgs import results
 from padgs.checks import ConfigError
 from padgs.multirun.overrides import root
 from padgs.multirun.sweep import sweep
+from padgs.reports import store
 
 TINY = [*SMALLEST, "train.iterations=40", "run.checkpoint_every=5", "tracking=none"]
 SWEEP = ["-m", "method=padgs", "method.tau=0.0,0.5,0.9,1.0", "seed=0,1,2"]
@@ -22,9 +22,9 @@ SWEEP = ["-m", "method=padgs", "method.tau=0.0,0.5,0.9,1.0", "seed=0,1,2"]
 
 def marks(folder: Path) -> dict[str, tuple]:
     """Run -> all that must not depend on how it came about."""
-    found, broken = results.read_all(folder)
+    found, broken = store.read(folder)
     assert not broken
-    ends = found.values()
+    ends = [run.result for run in found]
     return {result.run: (result.status, result.scores, result.counts, result.iterations_done) for result in ends}
 
 

@@ -69,10 +69,8 @@ def test_without_a_library_for_it_a_gpu_is_left_alone_and_that_is_said(monkeypat
         raise error
 
     monkeypatch.setattr(cuda, "require", missing)
-    monkeypatch.setenv("SLURM_JOB_GPUS", "3")
-    with pytest.raises(ValueError, match=f"this job of Slurm has a GPU, which is not used: {error}; or set run.device"):
-        choose_device("auto", RenderConfig())
-    monkeypatch.delenv("SLURM_JOB_GPUS")
+    with pytest.raises(ValueError, match=f"a GPU is here, but cannot be used: {error}; or set run.device=cpu"):
+        choose_device("auto", RenderConfig(), strict=True)
     with pytest.warns(UserWarning, match=f"a GPU is here, but the CPU is used: {error}"):
         assert choose_device("auto", RenderConfig()).type == "cpu"
     assert choose_device("cuda", RenderConfig()) == GPU, "by torch"

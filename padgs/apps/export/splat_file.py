@@ -86,7 +86,7 @@ def _lost(splats: Splats, written: Splats, path: Path) -> str:
 def _convert(source: Path, target: Path, *more: str) -> None:
     # The converter leaves files of its own beside its target after an error: that must be in a folder that is removed.
     # One iteration over the palette of .sog and .html: 27 000 Gaussians take 26 s; ten take 226 s and gain 0.01 dB.
-    options = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
+    options = ["--quiet", "--overwrite", "--gpu", "cpu", "-i", "1"]  # -i: named otherwise in version 3
     command = [CONVERTER, *options, *more, str(source.resolve()), str(target.resolve())]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode or not target.exists():

@@ -7,7 +7,6 @@ file, which all versions write.
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,7 +70,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     if "points3D" in files:
         points = model_files.read_points(files["points3D"])
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
-    notes = [*_file_notes(path, model, files, colored is not None), *_reference_notes(images, points)]
+    notes = _file_notes(path, model, files, colored is not None)
     tracks = partial(_tracks, images, points.row_of)
     return Capture("colmap", path, folder, frames, points.cloud, tracks=tracks, notes=tuple(notes))
 
@@ -92,18 +91,6 @@ def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) 
     texts = {file.stem for file in files_with(model, ".txt")}
     if double := [file.name for file in files.values() if file.suffix.lower() == ".bin" and file.stem in texts]:
         notes.append(f"the model is there as text and binary; {listed(double)} are used, not the text files")
-    return notes
-
-
-def _reference_notes(images: list[model_files.Image], points: model_files.Points) -> list[str]:
-    """Say which references between the files lead nowhere; they are left out."""
-    notes = []
-    named = np.concatenate([np.zeros(0, np.int64), *(image.points for image in images)])
-    known = np.isin(named, list(points.row_of))
-    absent = int((~known & (named != model_files.NO_POINT)).sum())
-    if absent and points.row_of:
-        total = absent + int(known.sum())
-        notes.append(f"{absent} of {total} observations are of points that the model does not hold; they are left out")
     return notes
 
 

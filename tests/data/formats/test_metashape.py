@@ -136,6 +136,8 @@ def test_labels_without_folder_or_ending_are_found_in_folders(folder: Path) -> N
     for number in range(6):
         place = "Group 1" if number < 2 else "day 2"
         (folder / f"images/pano_0{number}.png").rename(folder / f"images/{place}/pano_0{number}.JPG")
+    (folder / "images/masks").mkdir()
+    (folder / "images/masks/pano_03.png").touch()  # no photograph
     names = [frame.name for frame in read(folder).frames]
     assert names == [f"{'Group 1' if n < 2 else 'day 2'}/pano_0{n}.JPG" for n in range(6)]
     (folder / "images/third").mkdir()
