@@ -69,9 +69,8 @@ def split(
     given = {key: value for key, value in asdict(options).items() if key in KEPT}
     given["cameras"] = "panoramas"  # of the merged run too
     for key in ("images", "mask", "points"):  # `padgs merge` may run elsewhere
-        if given[key]:
-            path = given_path(given[key], source)
-            given[key] = given[key] if path == source / given[key] else str(path)
+        if given[key] and (path := given_path(given[key], source)) != source / given[key]:
+            given[key] = str(path)
     written = {}
     destination.parent.mkdir(parents=True, exist_ok=True)
     with draft_of(destination) as partial:

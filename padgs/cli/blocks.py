@@ -31,8 +31,7 @@ def split(
     options = DataOptions(mask=mask, split=split, images=images or None, points=points, depth=depth)
     with name_place(destination):
         written, notes = write(Path(source), destination, blocks, format, options)
-    for note in notes:
-        show(f"  {note}")
+    show("\n".join(f"  {note}" for note in notes))
     for folder, content in written.items():
         show(f"{folder}: {content}")
     names = ",".join(f'"{folder}"' if "," in folder else folder for folder in map(str, written))

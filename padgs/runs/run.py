@@ -162,8 +162,7 @@ def start(config: RunConfig) -> torch.device:
     if config.run.threads_per_job is not None:
         torch.set_num_threads(config.run.threads_per_job)
     torch.manual_seed(config.seed)
-    strict = "SLURM_JOB_GPUS" in os.environ  # others wait for a GPU that this job of Slurm would not use
-    device = choose_device(config.run.device, config.render, strict=strict)
+    device = choose_device(config.run.device, config.render, strict="SLURM_JOB_GPUS" in os.environ)
     clock.reset_peak_memory(device)
     return device
 

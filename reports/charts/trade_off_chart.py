@@ -137,8 +137,7 @@ def time_chart(trade_off: TradeOff) -> Chart | None:
     write_labels(panel, labels, [*ends, *_along(panel)])
     lost = "; ".join(sorted({point.title for point in trade_off.points} - {setting.title for setting, _, _ in curves}))
     notes = [f"Without logs in all scenes, so without a line: {lost}."] if lost else []
-    own = [setting.runs for setting, _, _ in curves]
-    if absent := [run for runs in own for run in runs.loc[~_has_log(runs), "run"]]:
+    if absent := [run for of, _, _ in curves for run in of.runs.loc[~_has_log(of.runs), "run"]]:
         notes.append(f"Without a complete log, so in no line: {', '.join(absent)}.")
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, (*trade_off.notes, *notes))
 
