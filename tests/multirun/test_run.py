@@ -105,7 +105,7 @@ def test_the_ablation_is_one_command_and_its_table_another(start, tmp_path, cach
         report, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    for result in found.values():
+    for result in (run.result for run in found):
         assert f"{result.scores['paper'].metrics['psnr']:.2f}" in done.stdout
     written = {path.name for path in (tmp_path / "runs" / "reports").iterdir()}
     assert written == {"table3.csv", "table3.md", "table3.tex"}
