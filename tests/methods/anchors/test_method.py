@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 48, 24
 EAGER = PaDGSMethodOptions(  # grows often: in a run of 60 iterations after 8, before 40
     offsets=4, voxel_size=0.05, statistics_from=2000, grow_from=4000, grow_until=20_000, grow_every=4
 )
-TORCH = RenderConfig(backend="torch")
+RENDER = RenderConfig()
 
 
 def scene(scale: float = 1.0) -> Scene:
@@ -40,7 +40,7 @@ def scene(scale: float = 1.0) -> Scene:
 
 
 def trained(iterations: int, *, scale: float = 1.0, options=EAGER, seed: int = 0):
-    method = PaDGSMethod(options, TORCH, TrainOptions(), seed)
+    method = PaDGSMethod(options, RENDER, TrainOptions(), seed)
     return method, list(method.fit(scene(scale), Budget(iterations)))
 
 
@@ -66,14 +66,14 @@ def test_growth_happens_in_its_window_only(long_run):
 
 def test_resumed_run_is_bit_identical(long_run):
     whole, records = long_run
-    interrupted = PaDGSMethod(EAGER, TORCH, TrainOptions(), 0)
+    interrupted = PaDGSMethod(EAGER, RENDER, TrainOptions(), 0)
     run = interrupted.fit(scene(), Budget(60))
     for _ in range(22):
         next(run)
     state = interrupted.state()
     assert len(state.tensors["model/positions"]) != records[0].counts["anchors"]  # it has grown by then
 
-    resumed = PaDGSMethod(EAGER, TORCH, TrainOptions(), seed=99)  # the state brings all randomness along
+    resumed = PaDGSMethod(EAGER, RENDER, TrainOptions(), seed=99)  # the state brings all randomness along
     resumed.load_state(state)
     view = scene().test[0]
     assert torch.equal(resumed.render(view).image, interrupted.render(view).image)
@@ -109,7 +109,7 @@ def test_size_counts_parameters_and_bytes(long_run):
 
 
 def test_state_of_other_options_is_refused(long_run):
-    other = PaDGSMethod(replace(EAGER, features=16), TORCH, TrainOptions())
+    other = PaDGSMethod(replace(EAGER, features=16), RENDER, TrainOptions())
     with pytest.raises(ValueError, match="features of the stored model has shape"):
         other.load_state(long_run[0].state())
 
@@ -146,7 +146,7 @@ def test_the_rate_of_offsets_is_in_its_unit(unit, views, rate):
     """One camera, whose extent is 0, can still place Gaussians."""
     world = scene()
     few = replace(world, train=world.train[:views])
-    method = PaDGSMethod(replace(EAGER, offset_rate_unit=unit), TORCH)
+    method = PaDGSMethod(replace(EAGER, offset_rate_unit=unit), RENDER)
     next(method.fit(few, Budget(100)))
     assert method.model.groups()[0].learning_rate(0) == pytest.approx(rate(few))
 
