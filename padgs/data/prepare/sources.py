@@ -54,17 +54,17 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
     installed, that the file cannot be decoded, or that its frames are no panoramas.
     """
-    written, seen = 0, set[bytes]()
+    seen = set[bytes]()
     for frame in _sharpest(video, per_second, progress):
         digest = hashlib.sha256(frame.tobytes()).digest()
         if digest in seen:  # of a still, or of a title that comes again
             continue
-        written, seen = written + 1, seen | {digest}
-        Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
-    if written < 2:
-        what = f"{video} gives {written} different frames at {per_second:g} a second; poses need at least two"
+        seen.add(digest)
+        Image.fromarray(frame).save(folder / f"frame_{len(seen):05d}.jpg", quality=95, subsampling=0)
+    if len(seen) < 2:
+        what = f"{video} gives {len(seen)} different frames at {per_second:g} a second; poses need at least two"
         raise DataError(f"{what}: take more a second (`--per-second`), or a longer video")
-    return written
+    return len(seen)
 
 
 def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[NDArray[np.uint8]]:
