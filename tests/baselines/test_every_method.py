@@ -101,8 +101,8 @@ def survives(setting: str, scene: Scene) -> None:
         rendering = method.render(view)
         assert rendering.image.shape == (view.height, view.width, 3)
         assert torch.isfinite(rendering.image).all() and not rendering.image.requires_grad
-        is_covered = rendering.transmittance.min() < 0.5  # 20 steps may give a bare room one colour
-        assert rendering.image.std() > 0.01 or is_covered, "it shows something"
+        least = 0.003 if "bare" in scene.name else 0.01  # whose walls have nearly one colour after so few steps
+        assert rendering.image.std() > least, "it shows something"
     size = method.size()
     assert size.parameters > 0 and size.bytes >= size.parameters and all(n > 0 for n in size.counts.values())
 

@@ -111,4 +111,4 @@ def test_injected_pose_noise_is_corrected(tmp_path, monkeypatch):
     ]
     print(rms, quality)
     assert rms["refined"][0] < 0.25 * rms["given"][0] and rms["refined"][1] < 0.6 * rms["given"][1]
-    assert quality[0] > quality[1]
+    assert quality[0] > quality[1] + 0.05
