@@ -319,6 +319,15 @@ def test_images_that_the_disk_cache_holds_do_not_count_against_it(tmp_path, monk
     assert disk_cache(options, 400)[0] == tmp_path / "cache"
 
 
+def test_a_disk_cache_that_cannot_be_made_is_done_without_unless_it_was_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "file" / "cache"))
+    (tmp_path / "file").touch()
+    folder, (note,) = disk_cache(DataOptions(cache_bytes=0), 400)
+    assert folder is None and "cannot write" in note and "each is decoded when it is needed" in note
+    with pytest.raises(DataError, match="data.disk_cache: cannot write .*; name another folder, or off"):
+        disk_cache(DataOptions(cache_bytes=0, disk_cache=str(tmp_path / "file" / "other")), 400)
+
+
 @pytest.mark.parametrize("place", [0.0, 5e6])
 def test_fingerprints_do_not_depend_on_the_last_bits_of_poses(
     place: float, world: World, tmp_path, monkeypatch

@@ -6,10 +6,13 @@ import pytest
 import torch
 from support.made_up import external, failed, result, small
 
-from padgs.reports.frame import by_place, frame, images_seen
+from padgs.baselines import BUILT_IN, METHODS
+from padgs.checks import lookup
+from padgs.reports.frame import by_place, frame, images_seen, law
 from padgs.reports.published import Place
 from padgs.reports.store import Run
 from padgs.scene import View
+from padgs.training.schedule import Pace
 from padgs.training.targets import Targets
 
 
@@ -127,3 +130,10 @@ def test_data_from_files_have_no_setting_of_the_generator():
 def test_models_of_other_programs_have_no_learning_rates():
     made = frame(map(Run, [external(25.0, "Brush")]))
     assert made["learning_rates"].isna().all() and made["rate_factor"].isna().all()
+
+
+@pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])
+def test_the_law_is_that_of_training(iterations):
+    assert law(iterations) == Pace.of("run", iterations).factor
+    for name in BUILT_IN:
+        assert law(iterations, name) == Pace.of(lookup(METHODS, name, "method").RUN_RATES, iterations).factor, name

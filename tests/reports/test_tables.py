@@ -7,8 +7,6 @@ import pytest
 from omegaconf import OmegaConf
 from support.made_up import RULES, budgets, builder, columns, compared, of_experiment, result, run_set, small, value
 
-from padgs.baselines import BUILT_IN, METHODS
-from padgs.checks import lookup
 from padgs.reports.frame import law
 from padgs.reports.methods import title
 from padgs.reports.significance import BEST, SECOND, emphasis
@@ -16,7 +14,6 @@ from padgs.reports.specs import DEVIATIONS, PARTS, RUNGS, WITHOUT
 from padgs.reports.table import ReportError, Table
 from padgs.reports.writers import markdown
 from padgs.results import Scores
-from padgs.training.schedule import Pace
 
 table1, table4, methods, equal_time = map(builder, ("table1", "table4", "methods", "equal_time"))
 ladder, deviations, order, length = map(builder, ("ladder", "deviations", "order", "length"))
@@ -377,13 +374,6 @@ def test_a_run_that_failed_before_its_first_iteration_has_no_length():
     rates = {"train": {"learning_rates": "run"}}
     early = replace(made[0], run="failed", iterations=0, status="oom", scores={}, config=rates)
     assert learning_rates(run_set([*made, early])) == learning_rates(run_set(made))
-
-
-@pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])
-def test_the_law_is_that_of_training(iterations):
-    assert law(iterations) == Pace.of("run", iterations).factor
-    for name in BUILT_IN:
-        assert law(iterations, name) == Pace.of(lookup(METHODS, name, "method").RUN_RATES, iterations).factor, name
 
 
 def test_voxels_are_crossed_with_modulation_and_the_paper_may_score_without_the_bottom():
