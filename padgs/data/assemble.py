@@ -21,6 +21,7 @@ from padgs.data.capture import (
     Frame,
     UnknownLens,
     first_of,
+    folded,
     given_path,
     listed,
     view_name,
@@ -184,8 +185,8 @@ def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_F
 def image_names(folder: Path) -> list[str]:
     """Return the names of all images below a folder, as in `file_names`, without the masks beside them."""
     names = [name for name in file_names(folder) if name.lower().endswith(EXTENSIONS)]
-    masks = {mask.casefold() for name in names for mask in masks_beside(name)}
-    return [name for name in names if name.casefold() not in masks]
+    masks = {folded(mask) for name in names for mask in masks_beside(name)}
+    return [name for name in names if folded(name) not in masks]
 
 
 def file_names(folder: Path) -> list[str]:
@@ -236,7 +237,7 @@ def found_images(capture: Capture) -> Capture:
     found = {}  # stated name -> file
     for name in (frame.name for frame in capture.frames if frame.name not in there):
         files = next((meant[key] for key in spellings(name.casefold()) if key in meant), set())
-        if not files and not there:  # labels, which state no folder
+        if not files and not there and "/" not in name:  # labels, which state no folder
             files = next((ends[key] for key in [*spellings(name.casefold())][:2] if key in ends), set())
         if len(files) > 1:
             way_out = "remove all but one, set data.images to its folder, or name it with folder and extension"
@@ -311,14 +312,17 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
             continue
+        if min(frame.width, frame.height) < 1 or (frame.lens is None and frame.width != 2 * frame.height):
+            rule = "a full panorama is 2:1" if frame.lens is None else "a camera has pixels"
+            raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; {rule}: correct its size")
         text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
         if frame.lens is not None:
             if abs(image.width / frame.width - image.height / frame.height) > 0.01:
                 raise DataError(f"{text}; make them agree")
             continue
-        if frame.width != 2 * frame.height or frame.width < 1:
-            rule = "a full panorama is 2:1: correct its size"
-            raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; {rule}")
+        if image.crop is not None and frame.width != image.width and abs(frame.width - image.crop.width) <= 1:
+            way_out = "run padgs prepare on the images, or remove their GPano tags if those are wrong"
+            raise DataError(f"{text}, which takes a part of a panorama for the whole; {way_out}")
         scales.setdefault((frame.width, frame.height), {}).setdefault(image.width / frame.width, text)
     for of_camera in scales.values():
         if len(of_camera) > 1:

@@ -154,9 +154,9 @@ def _check_images(frames: Sequence[Frame], report: Report, progress: Progress) -
 
 
 def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
-    """Build the scene; if that fails, retry without mask, split or points, to report all problems."""
-    mask, split, points = {"mask": "none"}, {"split": "all"}, {"points": "random"}
-    for change in ({}, mask, split, points, mask | split, mask | split | points):
+    """Build the scene; if that fails, retry without mask, split, points or depth, to report all problems."""
+    mask, split, points, depth = {"mask": "none"}, {"split": "all"}, {"points": "random"}, {"depth": "none"}
+    for change in ({}, mask, split, points, depth, mask | split, mask | split | points | depth):
         try:
             return assemble(capture, replace(options, **change))  # type: ignore[arg-type]
         except DataError as error:

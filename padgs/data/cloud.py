@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,10 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
             # Memory-mapped if binary: reading 500 000 Gaussians row by row takes minutes.
             data = PlyData.read(_plain_text(path) if is_text else str(path))
         except UnicodeDecodeError:
-            data = PlyData.read(_plain_text(path))
+            with NamedTemporaryFile() as plain:  # a file, to be memory-mapped as well
+                plain.write(_plain_text(path).getbuffer())
+                plain.flush()
+                data = PlyData.read(plain.name)
         vertex = data["vertex"]
     except DataError:
         raise

@@ -111,7 +111,7 @@ def read_depth(file: Path) -> NDArray[np.float32]:
     data = read_bytes(file)
     with refused_if_damaged(file):
         if file.suffix.lower() == ".npy":
-            values = np.load(BytesIO(data), allow_pickle=False)
+            values = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
         elif file.suffix.lower() == ".exr":
             values = _exr(file)
         else:
@@ -182,7 +182,7 @@ def _may_be_whole(file: Path) -> bool:
     if file.suffix.lower() != ".npy":
         return file.suffix.lower() != ".exr"
     with refused_if_damaged(file):
-        return np.load(file, mmap_mode="r", allow_pickle=False).dtype.kind in "iu"
+        return np.lib.format.open_memmap(file, mode="r").dtype.kind in "iu"
 
 
 def _stated(file: Path, may_be_whole: bool) -> DepthMeaning:
@@ -195,7 +195,7 @@ def _stated(file: Path, may_be_whole: bool) -> DepthMeaning:
         unit = stated["unit"] if may_be_whole and measure not in RELATIVE else stated.get("unit", 1)
         if measure not in MEASURES or isinstance(unit, bool) or not 0 < float(unit) < math.inf:
             raise ValueError(f"measure is {measure!r} and unit {unit!r}")
-    except (ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError, AttributeError, OverflowError) as error:
         raise DataError(f"{file} does not say what the depth maps hold ({error}); {HOW}") from error
     return DepthMeaning(measure, float(unit), file.name)
 

@@ -144,7 +144,7 @@ def srgb_conversion(image: Image.Image, data: bytes, path: object) -> Callable[[
             return _icc_conversion(profile)
         except (ImageCms.PyCMSError, OSError, ImportError, ValueError, TypeError) as error:
             raise DataError(f"{path} has an ICC profile that cannot be applied ({error}); {_TO_SRGB}") from error
-    exif = image.getexif() if image.format == "JPEG" else None
+    exif = image.getexif() if image.format in ("JPEG", "MPO") else None
     if exif and exif.get_ifd(ExifTags.IFD.Interop).get(1) == "R03":
         raise DataError(f"{path} is in Adobe RGB by its EXIF data, without an ICC profile; {_TO_SRGB}")
     if "srgb" in image.info:

@@ -217,15 +217,12 @@ def gps_of(image: Path) -> tuple[float, float, float] | None:
 
 
 def local_metres(places: Sequence[tuple[float, float, float]]) -> tuple[tuple[float, float, float], Tensor]:
-    """Return the mean place, and east, north and up [n, 3] of all in metres from it, by the radii of WGS 84 there."""
+    """Return the mean place, and east, north and up [n, 3] of all in metres from it, by WGS 84."""
+    import pycolmap
+
     degrees = np.array(places)
     degrees[:, 1] = degrees[0, 1] + (degrees[:, 1] - degrees[0, 1] + 180) % 360 - 180  # the 180th meridian is no gap
     origin = degrees.mean(0)
-    latitude = math.radians(origin[0])
-    axis, flat = 6_378_137.0, 0.006_694_379_990_141  # semi-major axis in metres, squared eccentricity
-    bulge = 1 - flat * math.sin(latitude) ** 2
-    north = axis * (1 - flat) / bulge**1.5 + origin[2]
-    east = (axis / bulge**0.5 + origin[2]) * math.cos(latitude)
-    metres = (degrees - origin)[:, [1, 0, 2]] * (math.radians(east), math.radians(north), 1.0)
+    metres = pycolmap.GPSTransform().ellipsoid_to_enu(degrees, *origin)
     origin[1] = (origin[1] + 180) % 360 - 180
     return tuple(origin.tolist()), torch.from_numpy(metres)

@@ -156,10 +156,13 @@ def _resolve(lines: Names, names: Names, which: str, unposed: Names, left_out: N
         for key in _keys(name):
             meant.setdefault(key, set()).add(i)
     meant |= {_keys(name)[0]: {i} for i, name in enumerate(known)}
+    folders = [_keys(name)[0].count("/") for name in known]
     chosen: set[int] = set()
     absent: list[str] = []
     for line in lines:
-        found = next((meant[key] for key in _keys(line) if key in meant), set())
+        whole = _keys(line)[0].count("/")  # folders; one name must be the end of the other, not only end alike
+        each = ({i for i in meant.get(key, ()) if key.count("/") in (whole, folders[i])} for key in _keys(line))
+        found = next(filter(None, each), set())
         if len(found) > 1:
             matches = listed(known[i] for i in sorted(found))
             raise DataError(f"the {which} names {line!r}, which matches {matches}; be specific")

@@ -123,6 +123,9 @@ def test_all_problems_are_reported_at_once(world: World, tmp_path: Path) -> None
         _save(tmp_path, f"images/{name}.png", world.images[2])
     problems = "\n".join(check(tmp_path).problems)
     assert "overlap" in problems and "hides every pixel" in problems
+    (tmp_path / "depths").mkdir()
+    np.save(tmp_path / "depths/pano_00.npy", np.ones((4, 8)))
+    assert "there is no depth.json" in (problems := "\n".join(check(tmp_path).problems)) and "overlap" in problems
 
 
 @pytest.mark.parametrize(

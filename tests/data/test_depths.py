@@ -189,6 +189,8 @@ def test_a_folder_of_depths_states_what_it_holds(unit: float, world: World, tmp_
             r"is an array of float64 \[4, 8, 3\]; it must",
         ),
         ('{"measure": "ray"}', b"\x93NUMPY", "is cut short or damaged"),
+        ('{"measure": "ray"}', b"PK\x03\x04 of an .npz", "is cut short or damaged"),
+        (f'{{"measure": "ray", "unit": {10**400}}}', np.ones((4, 8)), "does not say what the depth maps hold"),
         ('{"measure": "ray"}', np.full((4, 8), 2500, np.uint16), "does not say what the depth maps hold .*'unit'"),
     ],
 )

@@ -178,6 +178,16 @@ def test_what_a_part_does_not_show_is_masked(world: World, tmp_path: Path) -> No
     assert source.masks[f"{first}.png"]().sum() == 16 * 32 and "the rest is masked" in source.notes[0]
 
 
+def test_a_part_that_a_reconstruction_took_for_the_whole_is_refused(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)  # with cameras of 64x32
+    packet = xmp(FullPanoWidthPixels=128, FullPanoHeightPixels=64, CroppedAreaLeftPixels=32, CroppedAreaTopPixels=16)
+    for name, image in zip(world.names, world.images, strict=True):
+        path = tmp_path / "images" / f"{name}.png"
+        with_chunk(path, Image.fromarray(image), png_chunk(b"iTXt", XMP + packet))
+    with pytest.raises(DataError, match="is 128x64, its camera 64x32, which takes a part of a panorama for the whole"):
+        load(tmp_path)
+
+
 def test_colours_are_converted_to_srgb(tmp_path):
     grey = Image.fromarray(np.full((64, 128, 3), 55, np.uint8))
     linear = with_chunk(tmp_path / "linear.png", grey, png_chunk(b"gAMA", struct.pack(">I", 100_000)))

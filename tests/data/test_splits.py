@@ -78,6 +78,15 @@ def test_lists_may_name_what_is_left_out_which_stands_for_no_other_image(tmp_pat
         split_frames(names, _lists(tmp_path, "1.jpg", "2.jpg"), left_out=left_out)
 
 
+def test_a_line_names_no_image_that_only_ends_alike(tmp_path: Path) -> None:
+    names, folder = ["floor1/0001.jpg", "floor1/0002.jpg"], _lists(tmp_path, "0002", "floor2/0001.jpg")
+    with pytest.raises(DataError, match="names images that do not exist: 'floor2/0001.jpg'"):
+        split_frames(names, folder)
+    with pytest.raises(DataError, match="names images that have no pose: floor2/0001.jpg"):
+        split_frames(names, folder, unposed=["floor2/0001.jpg"])
+    assert split_frames(names, _lists(tmp_path, "0002", "scan/floor1/0001")).test == (0,), "a folder more"
+
+
 def test_unused_views_are_reported(tmp_path: Path) -> None:
     assert "3 posed views are in neither list and are not used" in split_frames(NAMES, _lists(tmp_path, "a", "b")).notes
 

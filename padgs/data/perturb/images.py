@@ -187,8 +187,9 @@ def resolution(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
         def pool_mask(mask: Tensor) -> Tensor:
             return _pool(mask[..., None], factor, stride=factor)[..., 0]
 
-        width, height = view.width // factor, view.height // factor
-        return replace(change_pixels(_panorama(view), pool, pool_mask), width=width, height=height, load_depth=None)
+        middle = slice(factor // 2, None, factor)
+        changed = change_pixels(_panorama(view), pool, pool_mask, lambda depth: depth[middle, middle])
+        return replace(changed, width=view.width // factor, height=view.height // factor)
 
     return change_training_views(scene, shrink)
 

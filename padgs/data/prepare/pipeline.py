@@ -4,6 +4,7 @@ Works in a hidden folder beside the destination, so that an interrupted call can
 when it is complete.
 """
 
+import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -119,8 +120,9 @@ class _Job:
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
             refuse_useless(options.known, {name: image.path for name, image in self.source.images.items()})
-        first = next(iter(self.source.images.values()))
-        self.threads = options.threads or work.threads_for(first.width, first.height)
+        width, height = max((image.width, image.height) for image in self.source.images.values())
+        size = (round(width / math.pi),) * 2 if options.accurate else (width, height)
+        self.threads = options.threads or work.threads_for(*size)
         kept = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
         self.folder.open("images", digest_of(self.source.fingerprint, options, _LATE), keep=kept)
         self.input = given or digest_of(self.source.fingerprint, options)
@@ -134,7 +136,8 @@ class _Job:
 
     def run(self) -> Prepared:
         """Run all steps that are not done."""
-        if not all((self.work / "images" / short).exists() for short in self.files):  # the source has moved
+        links = {self.work / "images" / short: path for short, path in self.paths.items()}
+        if not all(link.exists() and (not link.is_symlink() or link.samefile(links[link])) for link in links):  # moved
             (self.work / "views.done").unlink(missing_ok=True)
         with sfm.log_to(self.work / "log.txt"):
             self.folder.run_once("views", self._link_images)
@@ -240,6 +243,7 @@ class _Job:
         if self.destination.exists():
             self.destination.rmdir()
         partial_folder.rename(self.destination)
+        (self.work / "images.sha256").unlink(missing_ok=True)
         shutil.rmtree(self.work, ignore_errors=True)
         self.progress("result", 1, 1)
         return result

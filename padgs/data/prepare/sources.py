@@ -23,7 +23,7 @@ from padgs.data.scans import optional_module
 from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
 
-VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # raw files of 360-degree cameras
 UNSUPPORTED = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
 _NOT_STITCHED = "is not stitched: export panoramas, or a 2:1 video, with the camera's own program"

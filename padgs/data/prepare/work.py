@@ -27,13 +27,14 @@ PER_SECOND = 2.0
 LOCK = ".lock"  # of the process that works in the folder
 MAX_THREADS = 8
 MEMORY_PER_THREAD = 600_000_000  # bytes, for panoramas of 2048 x 1024, and for matching any size
-MAX_PIXELS = 3200 * 1600  # pycolmap reduces larger panoramas to this
+MAX_SIDE = 3200  # pixels; pycolmap reduces larger images to this
 MIN_FREE_DISK = 128 << 20  # bytes, several times the output of a batch of features or matches
 
 
 def threads_for(width: int, height: int) -> int:
-    """Return the number of threads for panoramas of a size: one per processor, at most 8, limited by free memory."""
-    each = MEMORY_PER_THREAD * max(1.0, min(width * height, MAX_PIXELS) / (2048 * 1024))
+    """Return the number of threads for images of a size: one per processor, at most 8, limited by free memory."""
+    pixels = width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
+    each = MEMORY_PER_THREAD * max(1.0, pixels / (2048 * 1024))
     free = free_memory()
     affordable = MAX_THREADS if free is None else int(free / each)
     return max(1, min(MAX_THREADS, cores(), affordable))
@@ -164,6 +165,7 @@ class WorkFolder:
         """Resume if the folder has the same digest of this kind of input; else delete all but `keep`."""
         marker = self.path / f"{kind}.sha256"
         if not (marker.is_file() and marker.read_text() == digest):
+            marker.unlink(missing_ok=True)  # first, so that nothing resumes where only a part is deleted
             for path in self.path.iterdir() if self.path.is_dir() else ():
                 if path.name not in (*keep, LOCK):
                     shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -23,6 +23,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("test_views", lambda x: 0 <= x <= MAX_VIEWS, f"at least 0 and at most {MAX_VIEWS}"),
     ("points", lambda x: 1 <= x <= 10**8, "at least 1 and at most 100 million"),
     ("spokes", lambda x: x >= 1, "at least 1"),
+    ("rooms", lambda x: x is None or x >= 1, "at least 1, or null for the default"),
     ("point_noise tilt lens_gap", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
     ("pose_noise_translation pose_noise_rotation", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
     ("texture_frequency world_scale", lambda x: 0 < x < math.inf, "a finite number > 0"),
@@ -32,6 +33,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("path_radius nearest horizon", lambda x: x is None or 0 < x < math.inf, "a finite length > 0 in metres, or null"),
     ("objects", lambda x: x is None or x >= 0, "at least 0, or null for the default"),
 )
+_OF_ONE_SCENE = {"rooms": "room_chain", "nearest": "near_clutter", "horizon": "outdoor", "spokes": "pole_torture"}
 
 
 @dataclass(frozen=True)
@@ -84,10 +86,10 @@ class SyntheticOptions:
                 f"{views} views of {self.width}x{self.height} are {pixels / 1e9:.1f} billion pixels, and at most "
                 f"{MAX_PIXELS / 1e9:g} are generated; lower data.width, data.generator.train_views or test_views"
             )
-        if self.rooms is not None and (self.scene != "room_chain" or self.rooms < 1):
-            rule = "only room_chain has this option, which must be 1 or more"
-            remedy = "set data.generator.scene=room_chain, or rooms to null"
-            raise DataError(f"rooms is {self.rooms} of scene {self.scene}; {rule}: {remedy}")
+        for name, scene in _OF_ONE_SCENE.items():
+            if (value := getattr(self, name)) != getattr(type(self), name) and self.scene != scene:
+                remedy = f"set data.generator.scene={scene}, or leave it out"
+                raise DataError(f"data.generator.{name} is {value}, and only {scene} has this option: {remedy}")
 
     @property
     def title(self) -> str:

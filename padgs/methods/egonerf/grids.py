@@ -96,13 +96,13 @@ class Factors(NamedTuple):
 class PlaneLines(nn.Module):
     """Learnable factors with C components per mode, initialised from a normal distribution."""
 
-    def __init__(self, components: int, shape: dict[str, int], scale: float = 0.1) -> None:
+    def __init__(self, components: int, shape: dict[str, int]) -> None:
         """Build factors; `shape` is the number of nodes along radius, polar and azimuth in each chart."""
         super().__init__()
 
         def noise(*axes: str) -> nn.Parameter:
             size = (components, CHARTS, *(shape[axis] for axis in axes))
-            return nn.Parameter(scale * torch.randn(size))
+            return nn.Parameter(0.1 * torch.randn(size))
 
         self.planes = nn.ParameterList([noise(*axes) for axes, _ in MODES])
         self.lines = nn.ParameterList([noise(axis) for _, axis in MODES])

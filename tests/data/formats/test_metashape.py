@@ -146,6 +146,14 @@ def test_labels_without_folder_or_ending_are_found_in_folders(folder: Path) -> N
         read(folder)
 
 
+def test_a_label_with_its_group_is_no_image_of_another_group(folder: Path) -> None:
+    _edit(folder, ('label="pano_00"', 'label="one/pano_00"'))
+    (folder / "images/two").mkdir()
+    for number in range(6):
+        (folder / f"images/pano_0{number}.png").rename(folder / f"images/two/pano_0{number}.JPG")
+    assert [frame.name for frame in read(folder).frames][:2] == ["one/pano_00", "two/pano_01.JPG"]
+
+
 def test_without_transforms_the_frame_is_that_of_the_chunk(folder: Path) -> None:
     _edit(folder, ('component_id="1"', 'component_id="0"'), (r"(?s)</cameras><transform>.*</transform>", "</cameras>"))
     _edit(folder, (r"(?s)<components>.*</components>", ""))

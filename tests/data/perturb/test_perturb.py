@@ -173,6 +173,8 @@ def test_masks_change_with_the_pixels():
     turned = perturbed("seam", 1, scene).train[0].load_mask()
     assert turned[:, 8:12].sum() == 0 and turned.sum() == mask.sum()
     assert perturbed("resolution", 1, scene).train[0].load_mask().shape == (8, 16)
+    known = replace(scene, train=tuple(replace(view, load_depth=lambda: 2 * mask) for view in scene.train))
+    assert torch.equal(perturbed("resolution", 1, known).train[0].load_depth(), 2 * mask[1::2, 1::2])
     assert perturbed("pitch", 1, scene).train[0].load_mask().shape == (16, 32)
 
 

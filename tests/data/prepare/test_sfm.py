@@ -77,6 +77,8 @@ def test_threads_are_limited_by_free_memory(monkeypatch):
     monkeypatch.setattr(work, "free_memory", lambda: free["bytes"])
     assert work.threads_for(2048, 1024) == work.threads_for(512, 256) == 3
     assert work.threads_for(4096, 2048) == work.threads_for(8192, 4096) == 1
+    free["bytes"] = 12_000_000_000
+    assert work.threads_for(8192, 4096) == 8 and work.threads_for(3200, 3200) == 4, "a side is limited, not the area"
     for free["bytes"] in (None, 64_000_000_000):
         assert work.threads_for(2048, 1024) == 8
     free["bytes"] = 1

@@ -167,7 +167,7 @@ def test_bad_input_is_refused(tmp_path):
 
 
 def test_videos_are_recognised_by_suffix_and_blur_lowers_sharpness(tmp_path):
-    assert is_video(tmp_path / "Tour.MP4") and not is_video(tmp_path / "tour.jpg")
+    assert is_video(tmp_path / "Tour.MP4") and is_video(tmp_path / "tour.mts") and not is_video(tmp_path / "tour.jpg")
     noise = np.random.default_rng(0).integers(0, 256, (64, 128), np.uint8)
     blurred = ((noise + np.roll(noise, 2, 0) + np.roll(noise, 2, 1).astype(int)) // 3).astype(np.uint8)
     assert sharpness(noise) > 1.3 * sharpness(blurred) > sharpness(np.full_like(noise, 9))

@@ -213,11 +213,25 @@ def test_cameras_of_a_room_chain_keep_away_from_walls(rooms, path):
     assert min(depth.min() for depth, _ in views) > 0.25
 
 
-def test_only_a_room_chain_has_a_number_of_rooms():
+@pytest.mark.parametrize(
+    ("scene", "options"),
+    [
+        ("room_chain", {"rooms": 3}),
+        ("near_clutter", {"nearest": 0.1}),
+        ("outdoor", {"horizon": 800.0}),
+        ("pole_torture", {"spokes": 4}),
+    ],
+)
+def test_options_of_one_scene_are_refused_in_others(scene, options):
+    assert SyntheticOptions(scene, **options)
+    with pytest.raises(DataError, match=f"only {scene} has this option: set data.generator.scene={scene}"):
+        SyntheticOptions("room", **options)
+
+
+def test_a_chain_has_at_least_one_room():
     assert SyntheticOptions("room_chain", rooms=3).title == "synthetic-room_chain-of-3"
-    for scene, rooms in (("room", 2), ("room_chain", 0)):
-        with pytest.raises(DataError, match="rooms is"):
-            SyntheticOptions(scene, rooms=rooms)
+    with pytest.raises(DataError, match="rooms is 0; it must be at least 1"):
+        SyntheticOptions("room_chain", rooms=0)
 
 
 def test_pole_torture_has_rods_above_and_below_the_cameras():

@@ -99,7 +99,10 @@ SHAPE = {"radius": 6, "polar": 4, "azimuth": 8}
 @pytest.fixture
 def grids() -> PlaneLines:
     torch.manual_seed(5)
-    return PlaneLines(3, SHAPE, scale=1.0).double()
+    made = PlaneLines(3, SHAPE).double()
+    for factor in made.parameters():
+        factor.data *= 10
+    return made
 
 
 def places(count: int, generator: torch.Generator) -> GridPosition:
