@@ -96,7 +96,7 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     points = capture.cloud.points[::step].double()
     views, views_of_train = [*train, *test], np.arange(len(train))
     seen = visibility(capture, views, points)
-    shared = csr_array(seen[: len(train)].astype(np.float32))
+    shared = csr_array(seen[: len(train)], dtype=np.float32)
     affinity = (shared @ shared.T).toarray().astype(np.float64)
     sizes = np.maximum(np.diag(affinity), 1)
     affinity = affinity / np.sqrt(sizes[:, None] * sizes) + 1e-6  # cameras that see nothing join any block

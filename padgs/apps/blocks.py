@@ -23,7 +23,7 @@ from torch import Tensor
 import padgs.data
 from padgs.apps.block_plan import plan, sphere_share
 from padgs.data.assemble import assemble
-from padgs.data.capture import Cloud, DataError, DataOptions, given_path, view_name
+from padgs.data.capture import Cloud, DataError, DataOptions, given_path, listed, view_name
 from padgs.data.depths import write_depths
 from padgs.data.formats.json_file import read_json
 from padgs.data.formats.transforms import REDUCED
@@ -34,7 +34,7 @@ from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of
 from padgs.results import flat
 from padgs.runs.console import say, show_result
-from padgs.runs.load import LoadedRun, load_run
+from padgs.runs.load import KEYWORDS, LoadedRun, load_run
 from padgs.runs.run import build_method, initial_result, load_scene, scored, start
 from padgs.runs.store import Labels, Progress, RunStore
 from padgs.runs.warm_start import WarmStart
@@ -69,8 +69,9 @@ def split(
     given = {key: value for key, value in asdict(options).items() if key in KEPT}
     given["cameras"] = "panoramas"  # of the merged run too
     for key in ("images", "mask", "points"):  # `padgs merge` may run elsewhere
-        if given[key] and (path := given_path(given[key], source)) != source / given[key]:
-            given[key] = str(path)
+        _, inverted, name = (given[key] or "").rpartition("inverted:")
+        if name not in KEYWORDS and (path := given_path(name, source)) != source / name:
+            given[key] = f"{inverted}{path}"
     written = {}
     destination.parent.mkdir(parents=True, exist_ok=True)
     with draft_of(destination) as partial:
@@ -170,6 +171,9 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
         init=WarmStart(" ".join(str(run.folder) for run in runs), together),
     )
     scene = load_scene(config, start(config))
+    trained = {view.name for run in runs for view in run.scene.train}
+    if leaks := [view.name for view in scene.test if view.name in trained]:
+        raise ValueError(f"blocks were trained on test views of {scene.name}, {listed(leaks)}; restore its split")
     store = RunStore.of(config, scene)
     if (before := store.result()) is not None and before.ok:
         show_result(before, store.path, console)

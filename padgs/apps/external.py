@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import CONVERTED, read_splats
-from padgs.apps.frame_check import FrameCheck, check_frame, nerfstudio_similarity, read_transform
+from padgs.apps.frame_check import FrameCheck, as_numbers, check_frame, nerfstudio_similarity, read_transform
 from padgs.checks import unknown
 from padgs.data.capture import FARTHEST, DataError, listed
 from padgs.data.formats.path_file import TRANSFORMS
@@ -35,7 +36,7 @@ from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering
-from padgs.results import CONFIG_NAME, LONGEST_NAME, Result, picture_name
+from padgs.results import LONGEST_NAME, Result, picture_name
 from padgs.runs.config import BudgetOptions, DataConfig, RunConfig, TrainConfig, choose_device
 from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import Method, initial_result, load_scene
@@ -60,7 +61,7 @@ class ExternalOptions:
     """The `method` group of the configuration of an external result."""
 
     sha256: str = ""  # of the file or the renders
-    transform: str = ""  # as the user stated it
+    transform: str = ""  # data_from_file, as numbers
 
 
 class ExternalMethod(SplatMethod):
@@ -91,7 +92,7 @@ def config_of(data: str, render: RenderConfig | None = None, device: str = "auto
     """Return the configuration of a data set: a folder with keys of the `data` group, or a run, whose data it is."""
     given = {name: value for name, value in settings.items() if value}
     usual = {name: PROTOCOLS[name] for name in ("paper", "sphere")}
-    if not (Path(data) / CONFIG_NAME).is_file():
+    if not RunStore(Path(data)).has_checkpoint:  # other programs write a config.yaml too
         group = DataConfig(path=data, **{"format": "auto", **given})
         config = RunConfig(data=group, method=METHOD, options=ExternalOptions(), protocols=usual)
     elif given:
@@ -148,21 +149,21 @@ class ExternalRun(LoadedRun):
         if not len(splats):
             raise DataError(f"{file} has no Gaussians with finite values; export it again")
         program = program_of(file)
-        if config is None:
-            scene = scene_without_photographs(splats, file)
-            config = RunConfig(render=render, method=METHOD, options=ExternalOptions(), protocols={})
-            scene = scene.to(choose_device(device, render))
-        else:
-            scene = load_scene(config, choose_device(device, render))
+        scene = None if config is None else load_scene(config, choose_device(device, render))
+        if scene is not None:
             origin = scene.origin.double().cpu()
             place = given(splats.means.detach().double().median(0).values)
             if (place - origin).norm() < place.norm():
                 world = Similarity(translation=-origin)
         if transform or world.translation.any():  # at once, because float32 holds no map coordinates
             splats = transform_splats(splats, world @ given)
+        if scene is None:
+            scene = scene_without_photographs(splats, file, given.rotation).to(choose_device(device, render))
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
             raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
-        config = replace(config, options=ExternalOptions(hashlib.sha256(file.read_bytes()).hexdigest(), transform))
+        options = ExternalOptions(hashlib.sha256(file.read_bytes()).hexdigest(), as_numbers(given) if transform else "")
+        config = config or RunConfig(render=render, method=METHOD, options=options, protocols={})
+        config = replace(config, options=options)
         splats.scene_scale = scene.scale
         splats.to(scene.points.device)
         folder = file.with_name(re.sub(r"(\.compressed)?\.\w+$", "", file.name))
@@ -201,7 +202,8 @@ def open_model(
         if transform or rays != "exact":
             raise ValueError(f"{path} is a run, whose renderer and world are known; leave out --rays and --transform")
         if Path(path).is_file():
-            raise ValueError(f"{path} is no {', '.join(SPLATS)}, and no folder of a run; give one of these")
+            kinds = f"{', '.join(SPLATS)}, and no folder of a run"
+            raise ValueError(f"{path} is no {kinds}; give one of these: splat-transform makes .ply of many formats")
         return replace(load_run(path, data_path=data, device=device), opened_with=opened_with)
     config = None if data is None else config_of(data, device=device)
     run = ExternalRun.open(Path(path), config, rays, transform, device)
@@ -211,10 +213,11 @@ def open_model(
     return run
 
 
-def scene_without_photographs(splats: Splats, file: Path) -> Scene:
+def scene_without_photographs(splats: Splats, file: Path, rotation: Tensor) -> Scene:
     """Return a scene whose points are the opaque Gaussians, with one view amid them; -y is up if the file says nothing.
 
-    Where half of them are in one place, as a single one is, the view is before it.
+    `rotation` [3, 3] has turned the file's world, and so the up that it states. Where half of them are in one place, as
+    a single one is, the view is before it.
     """
     opaque = torch.sigmoid(splats.opacity_logits) >= OPAQUE
     opaque = opaque if opaque.any() else torch.ones_like(opaque)
@@ -225,7 +228,7 @@ def scene_without_photographs(splats: Splats, file: Path) -> Scene:
     if (points - middle).norm(dim=1).median() == 0:
         middle[2] -= 10 * splats.log_scales[opaque].exp().max()
     if re.search(rb"(?i)comment vertical axis: z\b", _header(file)):  # of nerfstudio
-        pose[:3, :3] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        pose[:3, :3] = pose.new_tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ rotation.mT
     pose[:3, 3] = -pose[:3, :3] @ middle
     return Scene("no photographs", (View("middle", pose, 2048, 1024),), (), points, colors, "")
 

@@ -1,6 +1,7 @@
 """World of a file of Gaussians: transforms that users state, and a check that the file's world is the scene's."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -109,6 +110,8 @@ class FrameCheck:
         return self.psnr >= self.one_color + (MARGIN if self.suggestion or self.rays else LEAST)
 
     def __str__(self) -> str:
+        if self.psnr == math.inf:
+            return "the training views compared have one colour each, so the world of the file cannot be checked"
         text = f"training views at {WIDTH} pixels: {self.psnr:.1f} dB; one colour each: {self.one_color:.1f} dB"
         if self.fits:
             return f"{text}; the file is in the world of the scene"
@@ -137,7 +140,7 @@ def check_frame(
     truths = [_small(view) for view in views]
     constants = [mean_color(truth, sphere_weight(truth, mask)).item() for _, truth, mask in truths]
     if not (compared := [index for index, constant in enumerate(constants) if constant < ONE_COLOR]):
-        return FrameCheck(float("inf"), 0.0)
+        return FrameCheck(math.inf, 0.0)
     truths, flat = [truths[index] for index in compared], mean(constants[index] for index in compared)
 
     def quality(scene_from_file: Similarity, count: int = VIEWS, draw: Render = render) -> float:

@@ -80,7 +80,7 @@ def _message(error: Exception, *, run: str = "", beside: str = "", **_: object) 
         return f"{error.filename}: {error.strerror}"
     given = [*filter(None, (run, beside))]
     is_of_a_file = str(error).startswith(tuple(f"{Path(one)} " for one in given))  # of Gaussians
-    if run and isinstance(error, DataError) and not is_of_a_file:
+    if run and isinstance(error, DataError) and not (is_of_a_file or Path(run).is_file()):
         runs = " or ".join(given)
         return f"{error}; it is the data of {runs}: if it has moved, name its place with --data"
     return str(error) or "out of memory"

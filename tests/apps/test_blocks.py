@@ -243,6 +243,15 @@ def test_what_cannot_be_merged_is_refused(source, parts, runs, tmp_path):
     assert "has data.split=all, with other test views" in error(runs[0], whole[1])
     merged = padgs.load_run(merge(whole, Console(quiet=True)), device="cpu")
     assert not merged.scene.test and not merged.result.scores, "all views were trained on"
+    split = (source / "transforms.json").read_text()
+    leaking = json.loads(split)
+    leaking["test_filenames"], leaking["train_filenames"] = (
+        leaking["train_filenames"][:4],
+        leaking["train_filenames"][4:],
+    )
+    (source / "transforms.json").write_text(json.dumps(leaking))
+    assert "blocks were trained on test views of rooms" in error(*runs)
+    (source / "transforms.json").write_text(split)
     text = (described := parts[0] / BLOCK).read_text()
     damages = {"": "block.json is empty", "{": "is not valid JSON", "[1]": "must be an object", "{}": "lacks the field"}
     for damage, words in damages.items():
@@ -263,6 +272,22 @@ def test_blocks_are_beside_the_working_folder_too(tmp_path, monkeypatch):
     monkeypatch.setattr(blocks, "split", lambda source, destination, *_: ({destination: ""}, ()))
     done = CliRunner().invoke(app, ["split", ".", "--blocks", "2"])
     assert str(tmp_path / "capture-blocks") in done.output.replace("\n", "")
+
+
+def test_words_are_no_folders_and_links_lead_to_the_disk_meant(source, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("auto", "disk"):
+        (tmp_path / name).mkdir()
+    people = np.zeros((16, 32), np.uint8)
+    people[12:] = 255
+    Image.fromarray(people).save(tmp_path / "people.png")
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "blocks")
+    arguments = ["split", str(source), "--blocks", "2", "--mask", "inverted:people.png", "--to", "link"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    (block, _) = sorted((tmp_path / "disk" / "blocks").glob("rooms-block-*"))
+    options = json.loads((block / BLOCK).read_text())["options"]
+    assert (options["mask"], options["points"]) == (f"inverted:{tmp_path / 'people.png'}", "auto")
 
 
 def test_what_cannot_be_split_is_refused_and_nothing_is_written(source, parts, tmp_path):

@@ -1,6 +1,7 @@
 """Models of other programs: Gaussians and renders, scored like a run; and the check of their world."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from padgs.apps import external
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
-from padgs.apps.frame_check import _closest_points, _worlds, as_numbers, check_frame, read_transform
+from padgs.apps.frame_check import FrameCheck, _closest_points, _worlds, as_numbers, check_frame, read_transform
 from padgs.cli.commands import app
 from padgs.data.capture import DataError
 from padgs.data.perturb import StressOptions
@@ -303,6 +304,32 @@ def test_gaussians_are_shown_without_a_data_set(splats, tmp_path, generator):
     (tmp_path / "g" / "other.png").touch()
     code, shown = padgs_command("render", tmp_path / "a.ply", *arguments[2:], "--to", tmp_path / "g")
     assert code == 1 and opened.notes[0] in shown, "before the work, which fails here"
+
+
+def test_a_transform_moves_the_camera_along_without_a_data_set(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", random_splats(0, generator), ["Vertical Axis: z"])
+    plain = open_model(str(tmp_path / "a.ply"), device="cpu").scene
+    moved = open_model(str(tmp_path / "a.ply"), transform=as_numbers(MOVED), device="cpu").scene
+    assert torch.allclose(moved.points.double(), MOVED(plain.points.double()), atol=1e-4)
+    up, turned = (scene.train[0].cam_from_world[1, :3] for scene in (plain, moved))
+    assert torch.allclose(turned, MOVED.rotation @ up.double(), atol=1e-6)
+    assert (moved.train[0].center - moved.points.median(0).values).abs().max() < 1e-4
+    assert moved.scale == pytest.approx(1.7 * plain.scale, rel=0.3)
+
+
+def test_one_matrix_is_one_transform_however_it_is_written(splats, tmp_path):
+    (tmp_path / "t.txt").write_text("1 0 0 2\n0 1 0 0\n0 0 1 0\n")
+    forms = ("1 0 0 2 0 1 0 0 0 0 1 0", str(tmp_path / "t.txt"))
+    assert len({open_model(str(splats), transform=form, device="cpu").config.options for form in forms}) == 1
+
+
+def test_a_data_set_with_a_config_of_its_own_is_no_run(tmp_path):
+    (tmp_path / "config.yaml").write_text("processes: 4\n")  # of OpenSfM
+    assert external.config_of(str(tmp_path), format="opensfm").data.format == "opensfm"
+
+
+def test_views_of_one_colour_tell_nothing_about_the_world():
+    assert str(FrameCheck(math.inf, 0.0)).endswith("so the world of the file cannot be checked")
 
 
 def test_viewers_widen_by_pixels_of_the_image_that_they_draw(splats):

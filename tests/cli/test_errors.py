@@ -119,7 +119,7 @@ def test_errors_are_one_line(error, message, capsys):
     assert capsys.readouterr().err == f"{message}\n"
 
 
-def test_a_damaged_file_of_gaussians_is_not_taken_for_the_data_of_a_run(capsys):
+def test_a_damaged_file_of_gaussians_is_not_taken_for_the_data_of_a_run(capsys, tmp_path):
     @without_traceback
     def command(run: str, beside: str = "") -> None:
         raise DataError("a.ply is no PLY file; export it again")
@@ -135,6 +135,10 @@ def test_a_damaged_file_of_gaussians_is_not_taken_for_the_data_of_a_run(capsys):
         with pytest.raises(RuntimeError):  # `typer.Exit`
             command(run=run, beside=beside)
         assert capsys.readouterr().err == f"error: a.ply is no PLY file; export it again{more}\n"
+    (tmp_path / "b.ply").touch()
+    with pytest.raises(RuntimeError):
+        command(run=str(tmp_path / "b.ply"), beside="")
+    assert place not in capsys.readouterr().err, "a file has no data"
 
 
 def test_warnings_are_one_line():

@@ -70,7 +70,8 @@ def export_run(
         if distillation_steps != DISTILLATION_STEPS:
             notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
     elif isinstance(model, AnchorModel):
-        _inside(model.anchors.centers(), crop)  # before the long work
+        given_from_model = (run.method.world or Similarity()).inverse()
+        _inside(given_from_model(model.anchors.centers().double().cpu()), crop)  # before the long work
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
     else:
@@ -122,14 +123,17 @@ def _inside(means: Tensor, crop: Sequence[float] | None) -> Tensor | None:
 
 def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
     scene, config, method = run.scene, run.config.render, run.method
-    options = config.options(scene.scale)
-    views = sample_cameras(scene.train)
+    options, world = config.options(scene.scale), method.world or Similarity()
+    views = [view.at(world.pose(view.cam_from_world)) for view in sample_cameras(scene.train)]
     splats = bake(method.model.anchors, views, options, config.backend, scene.scale)
-    if steps:
-        distill(splats, method.render, replace(scene, train=tuple(views)), config, steps, progress)
+    if steps:  # on ideal renders in the world of the model
+        distill(splats, method.model.render, replace(scene, train=tuple(views)), config, steps, progress)
+    if method.world is not None:
+        splats = transform_splats(splats, world.inverse())
 
     def render_splats(view: View) -> Rendering:
-        return render(splats.gaussians(view), view, options, backend=config.backend)
+        drawn = render(splats.gaussians(view), view, options, backend=config.backend)
+        return method.photographed(drawn, view)
 
     kind = "test" if scene.test else "training"
     protocol = replace(PROTOCOLS["sphere"], lpips="none", metrics=("ws_psnr",))

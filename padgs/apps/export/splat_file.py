@@ -30,7 +30,8 @@ RUINED = 0.05  # share of Gaussians that a format may move by more than their si
 MAX_LOGIT = 30.0  # formats of 8 bits hold opacities of exactly 0 and 1, whose logits are infinite
 _POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-_NEEDED = (*_POSITION, *_COLOR, *_LAST)
+_NEEDED = [name for name in (*_POSITION, *_COLOR, *_LAST) if name != "scale_2"]
+_DISC = -9.0  # logarithm of the thickness of discs of 2DGS, which have no scale_2, relative to their smaller radius
 
 
 def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> str:
@@ -149,7 +150,10 @@ def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -
     sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
     quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
     quats[~quats.any(1), 0] = 1  # no rotation
-    rows = {"means": columns(*_POSITION), "log_scales": columns("scale_0", "scale_1", "scale_2"), "quats": quats}
+    scales = columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names))
+    if "scale_2" not in names:
+        scales = torch.cat((scales, scales.amin(1, keepdim=True) + _DISC), dim=1)
+    rows = {"means": columns(*_POSITION), "log_scales": scales, "quats": quats}
     rows |= {"sh_dc": columns(*_COLOR), "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2)}
     splats.load(rows | {"opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT)})
     splats.active_degree = degree

@@ -143,6 +143,22 @@ def test_anchors_are_baked_and_the_loss_is_reported(tmp_path_factory, tmp_path):
     assert len(read_splats(tmp_path / "a.ply")) > 0
 
 
+@pytest.mark.parametrize("camera", ["train.poses=learned_fast", "train.lens=map"])
+def test_anchors_of_a_learned_camera_are_baked_in_the_given_world(camera, tmp_path_factory, monkeypatch):
+    run, given = padgs.load_run(tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=2", camera)), []
+    with torch.no_grad():
+        for shift in () if run.method.world is None else run.method._poses.shifts:
+            shift += torch.tensor([0.3, 0.0, 0.0])
+    world = run.method.world or Similarity()
+    monkeypatch.setattr(explicit, "distill", lambda splats, teacher, scene, *_: given.extend((teacher, scene.train[0])))
+    splats = export_run(run).splats
+    centers = world.inverse()(run.method.model.anchors.centers().double())
+    assert torch.cdist(splats.means.double(), centers).amin(1).max() < 1e-5
+    teacher, view = given
+    assert teacher == run.method.model.render, "ideal renders"
+    assert torch.equal(view.cam_from_world, world.pose(run.scene.train[0].cam_from_world))
+
+
 def test_methods_without_gaussians_are_refused(tmp_path_factory, tmp_path, splat_run):
     folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
     (tmp_path / "file").touch()

@@ -12,7 +12,7 @@ from support.splat_cases import random_splats
 from padgs.apps.export import splat_file
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.data.capture import Cloud, DataError
-from padgs.data.cloud import write_ply
+from padgs.data.cloud import read_vertices, write_ply
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -63,6 +63,26 @@ def test_a_stored_filter_widens_and_a_zero_quaternion_turns_nothing(tmp_path, ge
     opacities = torch.sigmoid(splats.opacity_logits) * 0.8**3
     torch.testing.assert_close(torch.sigmoid(found.opacity_logits), opacities)
     assert found.quats[2].tolist() == [1, 0, 0, 0]
+
+
+def test_discs_of_2dgs_are_thin_gaussians(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", splats := random_splats(1, generator))
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    flat = rfn.drop_fields(vertex, "scale_2")
+    PlyData([PlyElement.describe(flat, "vertex")]).write(str(tmp_path / "b.ply"))
+    found = read_splats(tmp_path / "b.ply")
+    torch.testing.assert_close(found.log_scales[:, :2], splats.log_scales[:, :2])
+    assert (found.log_scales[:, 2] < splats.log_scales[:, :2].amin(1) - 8).all() and torch.equal(
+        found.means, splats.means
+    )
+
+
+def test_a_binary_file_with_letters_of_any_alphabet_is_read_at_once(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", random_splats(1, generator), ["x"])
+    (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(b"comment x", "comment Müller".encode()))
+    vertex, _ = read_vertices(tmp_path / "b.ply")
+    assert isinstance(vertex.data, np.memmap), "row by row takes minutes"
+    assert torch.equal(read_splats(tmp_path / "b.ply").sh_rest, read_splats(tmp_path / "a.ply").sh_rest)
 
 
 def test_invalid_files_are_refused(tmp_path, generator):
