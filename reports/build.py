@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from pandas import DataFrame, Series
@@ -293,15 +292,16 @@ class _Pivot(_Builder):
             rows = (Row(f"× {f:g}", tuple(cells[f].get(key, (Cell(),))[0] for key in keys)) for f in sorted(cells))
             blocks.append(Block(where, tuple(rows)))
             of_lengths = ({factor: of[key] for factor, of in cells.items() if key in of} for key in keys)
-            losses.append(Row(methods.title(preset), tuple(map(partial(self._loss, preset), keys, of_lengths)), True))
+            losses.append(Row(methods.title(preset), tuple(map(self._loss, keys, of_lengths)), True))
         columns = tuple(replace(column, higher_is_better=None) for column in keys.values())
         return [*blocks, Block(f"What the law loses, {title}", tuple(losses), columns)]
 
-    def _loss(self, preset: str, key: tuple[int], factors: Mapping[float, tuple[Cell, DataFrame]]) -> Cell:
+    def _loss(self, key: tuple[int], factors: Mapping[float, tuple[Cell, DataFrame]]) -> Cell:
         means = {factor: cell.value for factor, (cell, _) in factors.items() if cell.value is not None}
         if not means:
             return Cell()
-        near = min(means, key=lambda factor: abs(math.log(factor / law(key[0], methods.method_of(preset)))))
+        method = factors[next(iter(means))][1]["method"].iloc[0]
+        near = min(means, key=lambda factor: abs(math.log(factor / law(key[0], method))))
         best = max(means, key=lambda factor: means[factor])
         return _by_seed(factors[near][1], factors[best][1], self.measures[0])
 

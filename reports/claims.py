@@ -186,6 +186,7 @@ def findings(run_set: RunSet) -> Page:
         holding=paper.count(HOLDS),
         failing=sum(verdict.startswith((NOT_REPRODUCED, FAILS)) for verdict in paper),
         verdicts=verdicts,
+        as_published=any(one.tested["as published"].any() for one in tested if len(one.tested)),
         notes=[(no, one.claim) for no, one in numbered if one.claim.note],
         evidence=[(one, in_the_paper(one.claim, numbers)) for one in tested],
         marks={"": "", TUNED_ON: " †", NOT_TUNED_ON: " ‡"},

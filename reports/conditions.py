@@ -60,10 +60,13 @@ def sheets(runs: DataFrame, request: Request, kind: str, shared: Iterable[str]) 
 
 
 def as_published(runs: DataFrame) -> bool:
-    """Return whether runs have the size and the length of the paper, without which numbers cannot be compared."""
+    """Return whether runs have the size, length and rows of the paper, without which numbers cannot be compared."""
     kinds = {*zip(runs["method"], runs["resolution"], runs["length"], strict=True)}
     is_long = all(length == f"{PUBLISHED_LENGTHS.get(of, PUBLISHED_ITERATIONS)} iterations" for of, _, length in kinds)
-    return bool(kinds) and is_long and all(int(size.partition("x")[0]) >= PUBLISHED_WIDTH for _, size, _ in kinds)
+    wide = all(int(size.partition("x")[0]) >= PUBLISHED_WIDTH for _, size, _ in kinds)
+    rules = _values(runs, "paper rules").astype(str)
+    cropped = rules.str.contains("without the last 6.3", regex=False)  # the robot of 360Roam
+    return bool(kinds) and is_long and wide and cropped.eq(runs["dataset"][rules.index] == "roam360").all()
 
 
 def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:

@@ -17,7 +17,7 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.checks import printable
-from padgs.reports.methods import EXTERNAL
+from padgs.reports.methods import EXTERNAL, METHODS, outside
 from padgs.reports.published import SAME_DATA, Place
 from padgs.reports.store import Run
 from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, flat, picture_name
@@ -110,7 +110,8 @@ def law(iterations: int, method: str = "") -> float:
     >>> law(30_000), law(7500), law(100)
     (1.0, 2.0, 8.0)
     """
-    factor = LINEAR_ITERATIONS / iterations if method in LINEAR else math.sqrt(PUBLISHED_ITERATIONS / iterations)
+    linear = method in LINEAR or (method not in METHODS and outside(method, "RUN_RATES") == "run_linear")
+    factor = LINEAR_ITERATIONS / iterations if linear else math.sqrt(PUBLISHED_ITERATIONS / iterations)
     return min(max(factor, 1.0), LARGEST_FACTOR)
 
 
@@ -230,15 +231,13 @@ def _factor(result: Result) -> float | None:
     choice = result.config.get("train", {}).get("learning_rates", "published")
     if result.external or not result.iterations:
         return None
-    return 1.0 if choice == "published" else law(result.iterations, result.method) if choice == "run" else float(choice)
+    if choice in ("run", "run_linear"):
+        return law(result.iterations, "omnigs" if choice == "run_linear" else result.method)
+    return 1.0 if choice == "published" else float(choice)
 
 
 def _kinds(cameras: Mapping[str, str]) -> str | None:
-    """Return the number of test views of each kind of camera; None if all are panoramas.
-
-    >>> _kinds({"a": "panorama", "b": "pinhole", "c": "panorama"})
-    '2 panorama, 1 pinhole'
-    """
+    """Return the number of test views of each kind of camera, "2 panorama, 1 pinhole"; None if all are panoramas."""
     return ", ".join(f"{count} {kind}" for kind, count in Counter(cameras.values()).items()) or None
 
 

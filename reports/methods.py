@@ -18,7 +18,7 @@ EXTERNAL = "external: "  # presets of models and renders that another program ma
 
 @cache
 def outside(method: str, attribute: str) -> str:
-    """Return the title or color (#rrggbb) of a method of another package, an attribute of its class; else empty."""
+    """Return a text of the class of a method of another package, e.g. title or color (#rrggbb); else empty."""
     for point in entry_points(group="padgs.methods", name=method):
         try:
             value = getattr(point.load(), attribute, "")

@@ -100,7 +100,7 @@ class StressedMethod:
         for stress, runs in self.runs.items():
             without = runs["seed"].map(above).fillna(above.mean())  # without a reference the mean of the other seeds
             shares = ((runs[QUALITY] - runs[ONE_COLOR]) / without).clip(0, 1).where(runs["ok"], 0.0)
-            found[stress] = mean_cell(shares.tolist(), failures(runs))
+            found[stress] = mean_cell(shares[without > 0].tolist(), failures(runs))  # else there is nothing to keep
         return found
 
     def levels(self, condition: str) -> dict[int, Cell]:

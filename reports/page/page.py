@@ -10,6 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from pandas import DataFrame
 from PIL import Image
@@ -93,7 +94,9 @@ def album(run_set: RunSet) -> Album:
     count = min(MAX_VIEWS, max(1, MAX_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
     for place, shown in groups.items():
-        names = _spread(render_names(shown[0].runs["renders"].iloc[0]), count)
+        every = render_names(shown[0].runs["renders"].iloc[0])
+        even = np.linspace(0, len(every) - 1, count).round().astype(int)  # so that a path is seen from its whole length
+        names = [every[number] for number in dict.fromkeys(even)]
         opened += len(shown) * len(names)
         if opened > MAX_FILES:
             made.left_out.append(place.title)
@@ -128,17 +131,6 @@ def _view(made: Album, shown: Sequence[Setting], name: str, warnings: list[str])
         metric = "" if psnr is None else f", PSNR {psnr:.2f} dB"
         view["methods"].append({"title": f"{setting.title}{metric}", **images})
     return view
-
-
-def _spread(names: Sequence[str], count: int) -> list[str]:
-    """Return so many names evenly from the first to the last, so that a path is seen from several positions.
-
-    >>> _spread("abcde", 3), _spread("abcde", 1), _spread("ab", 3)
-    (['a', 'c', 'e'], ['a'], ['a', 'b'])
-    """
-    if len(names) <= count:
-        return list(names)
-    return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def _summary(runs: DataFrame) -> str:

@@ -8,6 +8,7 @@ from support.made_up import external, failed, result, small
 
 from padgs.baselines import BUILT_IN, METHODS
 from padgs.checks import lookup
+from padgs.reports import methods
 from padgs.reports.frame import by_place, frame, images_seen, law
 from padgs.reports.published import Place
 from padgs.reports.store import Run
@@ -130,6 +131,15 @@ def test_data_from_files_have_no_setting_of_the_generator():
 def test_models_of_other_programs_have_no_learning_rates():
     made = frame(map(Run, [external(25.0, "Brush")]))
     assert made["learning_rates"].isna().all() and made["rate_factor"].isna().all()
+
+
+def test_every_choice_of_learning_rates_has_a_factor(monkeypatch):
+    rates = [{"train": {"learning_rates": choice, "iterations": 1500}} for choice in ("run", "run_linear", 4.0)]
+    made = frame(map(Run, [small(25.0, config=config, iterations=1500) for config in rates]))
+    assert made["rate_factor"].round(3).tolist() == [4.472, 2.0, 4.0]
+    monkeypatch.setattr(methods, "outside", lambda method, attribute: "run_linear")
+    monkeypatch.setattr("padgs.reports.frame.outside", methods.outside)
+    assert law(1500, "mine") == 2.0 and law(1500, "spags") > 4, "the rule of another package's method is its class's"
 
 
 @pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])

@@ -88,6 +88,8 @@ def test_a_method_that_one_scene_lacks_keeps_its_numbers_in_others(scene):
 @pytest.mark.parametrize("other", [{"width": 512, "height": 256}, {"iterations": 7000}])
 def test_there_is_a_difference_at_the_size_and_length_of_the_paper_only(other):
     assert "bar, Δ" not in across([result("", **other)])
+    whole = {"paper": replace(result("").scores["paper"], protocol=RULES)}
+    assert "bar, Δ" not in across([result("", scores=whole)]), "the paper cuts off the robot"
     both = across([result(""), result("", method="egonerf", preset="egonerf")])
     assert both["bar, Δ"]["PaD-GS"] == "+0.10" and both["bar, Δ"]["EgoNeRF"] == MISSING, "published with 100 000"
     seconds = result("", config={"budget": {"seconds": 60.0, "clock": "cpu"}})

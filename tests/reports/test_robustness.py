@@ -67,6 +67,12 @@ def test_robustness_is_the_share_above_one_colour():
     assert kept["seam 2"][OMNIGS] == "1.00", "at most 1"
 
 
+def test_nothing_is_kept_of_a_reference_below_one_colour():
+    made = [run("padgs", 11.0), run("padgs", 9.0, "seam", 1), run("padgs", 20.0, "seam", 2)]
+    kept = cells(stability(run_set(made))[0], "Robustness")
+    assert {of["PaD-GS"] for of in kept.values()} == {"–"}
+
+
 def test_scores_and_breakdowns():
     table, *_ = stability(run_set([*runs(), *MISSING]))
     scores, breaks = cells(table, "synthetic-room"), cells(table, "Breaks at level")

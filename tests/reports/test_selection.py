@@ -1,9 +1,11 @@
+import math
 from dataclasses import replace
 
 import pytest
 from pandas import DataFrame
 from support.made_up import run_set, small
 
+from padgs.reports import selection
 from padgs.reports.selection import Mixture, ReportError, Request, one_setting, select, separate, settings
 
 
@@ -73,3 +75,14 @@ def test_conditions_all_hold():
     assert chosen(where={"data.points": "null"}) == [0, 1, 2, 3, 4]
     with pytest.raises(ReportError, match="no run has data.points=5; runs have null"):
         chosen(where={"data.points": "5"})
+
+
+@pytest.mark.parametrize(
+    ("stored", "text", "same"),
+    [
+        *((60.0, "60", True), (True, "true", True), ("room", "rooms", False), ([1, 2], "[1,2]", True)),
+        *(([0.01, 0.0001], "[0.01, 0.0001]", True), (math.nan, "null", True), (None, "None", True)),
+    ],
+)
+def test_texts_that_mean_a_stored_value(stored, text, same):
+    assert selection._is_value(stored, text) == same
