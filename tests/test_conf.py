@@ -124,6 +124,11 @@ def test_what_the_command_line_sweeps_multiplies_with_the_file_or_replaces_it():
     ]
 
 
+def test_a_value_given_twice_is_one_job():
+    with composing() as loader:
+        assert expand({}, ["seed=0,1,1"], loader) == [["seed=0"], ["seed=1"]]
+
+
 def test_a_sweep_of_too_many_jobs_is_refused():
     with composing() as loader:
         for settings in (["seed=range(1,1e9)"], ["seed=range(0,101)", "train.iterations=range(1,101)"]):
@@ -143,6 +148,14 @@ def test_a_sweep_of_nothing_is_refused(setting):
 def test_a_sweep_of_folders_is_refused():
     with composing() as loader, pytest.raises(ValueError, match="^run.folder=a,b has several values; use one command"):
         expand({}, ["run.folder=a,b"], loader)
+
+
+def test_one_folder_beside_several_scenes_is_refused():
+    params = {"+scene": "synthetic_room,synthetic_outdoor"}
+    with composing() as loader:
+        with pytest.raises(ValueError, match="^data.path is beside 2 scenes; for that folder alone add ~scene_set"):
+            expand(params, ["++data.path=mine"], loader)
+        assert expand({}, ["++data.path=mine,other"], loader) == [["++data.path=mine"], ["++data.path=other"]]
 
 
 @pytest.mark.parametrize("launcher", [[], ["launcher=slurm"], ["launcher=ray"]])

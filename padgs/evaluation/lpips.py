@@ -104,8 +104,6 @@ class LPIPS(nn.Module):
         if min(height, width) < smallest:
             needs = f"LPIPS {self.network.name} needs at least {smallest} pixels per side"
             raise LpipsUnavailable(f"{needs}; image is {width}x{height}")
-        if inputs not in INPUTS:
-            raise ValueError(f"unknown LPIPS input {inputs!r}; known: {', '.join(INPUTS)} ([-1, 1] and [0, 1])")
         fed = (2 * image - 1, 2 * target - 1) if inputs == "11" else (image, target)
         shift, scale = image.new_tensor(CHANNEL_SHIFT), image.new_tensor(CHANNEL_SCALE)
         a, b = (((values - shift) / scale).permute(2, 0, 1)[None] for values in fed)

@@ -89,6 +89,9 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
     }
     _refuse_changed_rows(values, choices)
     _refuse_replaced_settings(choices)
+    path, scene = values.get("data", {}).get("path"), choices.get("scene")
+    if path is not None and scene is not None and "path" not in scene_choices().get(str(scene), {}).get("data", {}):
+        raise ConfigError(f"+scene={scene} generates a scene, but data.path={path} names a folder; leave out one")
     return config_from_values(values, labels(choices))
 
 

@@ -5,6 +5,7 @@ which asks all jobs to stop. Nothing else couples a job to its parent, so it run
 """
 
 import json
+import os
 import re
 import sys
 import time
@@ -36,6 +37,7 @@ from padgs.runs.store import RunBusy
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
 SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`
+SHOWN_GPUS = "PADGS_SHOWN_GPUS"  # CUDA_VISIBLE_DEVICES of the command, which submitit replaces by the first of all
 
 
 class Status:
@@ -137,6 +139,8 @@ class BoardEntry(Callback):
 def job_of_many(composed: DictConfig) -> str:
     """Do one run of a multirun and return its status; only an interruption is raised, so that the other jobs go on."""
     answer_signals()  # of a process of its own
+    if SHOWN_GPUS in os.environ:
+        os.environ["CUDA_VISIBLE_DEVICES"] = os.environ[SHOWN_GPUS]
     hydra = HydraConfig.get()
     board = Board(Path(hydra.sweep.dir))
     with ExitStack() as stack:

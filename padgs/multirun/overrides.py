@@ -184,7 +184,9 @@ def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLo
         if key.lstrip("+") == "run.folder" and len(first) > 1:
             raise ValueError(f"{override.input_line} has several values; use one command for each folder")
         texts = [override.get_value_element_as_str() if value is None else value for value in first]
-        choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in texts]
+        choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in dict.fromkeys(texts)]
+    if len(choices.get("scene", ())) > 1 and "data.path" in choices:
+        raise ValueError(f"data.path is beside {len(choices['scene'])} scenes; for that folder alone add ~scene_set")
     if math.prod(map(len, choices.values())) > MOST_JOBS:
         raise ValueError(f"the sweep has more than {MOST_JOBS} jobs; sweep fewer values, or use several commands")
     return [list(job) for job in itertools.product(*choices.values())]

@@ -5,6 +5,7 @@ line sums up all jobs while they run, and Ctrl-C lets running jobs write their c
 """
 
 import hashlib
+import os
 import shlex
 import shutil
 import signal
@@ -32,7 +33,7 @@ from rich.table import Table
 from padgs import results
 from padgs.checks import printable, typed, unknown
 from padgs.multirun.finished import FinishedJobs, signature
-from padgs.multirun.job import Board, JobState, Status, complain, in_own_process, job_of_many
+from padgs.multirun.job import SHOWN_GPUS, Board, JobState, Status, complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
 from padgs.multirun.slurm import NO_ANSWER, TOO_MANY, SubmissionRefused, wait_for_jobs
 from padgs.results import Result, ResultError
@@ -322,6 +323,8 @@ def launch(launcher: Any, jobs: list[list[str]], first_number: int, board: Board
     executor = submitit.AutoExecutor(folder=folder, cluster=cluster, **kept)
     common = OmegaConf.structured(BaseQueueConf)
     executor.update_parameters(**{key if key in common else f"{cluster}_{key}": parameters[key] for key in parameters})
+    if cluster == "local" and "CUDA_VISIBLE_DEVICES" in os.environ:
+        os.environ[SHOWN_GPUS] = os.environ["CUDA_VISIBLE_DEVICES"]
     ids = (f"job_id_for_{first_number + position}" for position in range(len(jobs)))
     state, key = repeat(Singleton.get_state(), len(jobs)), repeat("hydra.sweep.dir", len(jobs))
     numbers = range(first_number, first_number + len(jobs))

@@ -58,7 +58,7 @@ def objections(candidate: Scores, control: Scores, epsilon: float, shares: Share
     for band in BANDS:
         of_band = differences(candidate, control, f"{QUALITY}_{band}")
         weights = [shares[name][band] for name in of_band]
-        if sum(weights) < MIN_SHARE * len(shares):
+        if sum(weights) <= MIN_SHARE * len(shares):
             continue
         if not (mean := float(np.average([*of_band.values()], weights=weights))) > -BAND * epsilon:
             found.append(f"{band} falls by {-mean:.2f} dB")

@@ -23,7 +23,7 @@ from padgs.training.model import State
 FORMAT = 1
 MANIFEST = "state.json"
 TENSORS = re.compile(r"tensors-[0-9a-f]{16}\.safetensors")
-WAY_OUT = "delete the checkpoint folder to start this run from the beginning"
+WAY_OUT = "copy it again, take the padgs that wrote it, or delete the folder of the run to train anew"
 
 
 class CheckpointError(RuntimeError):
@@ -71,7 +71,7 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
     manifest = _manifest(folder)
     for what, wanted in (run or {}).items():
         if manifest["run"].get(what) != wanted:
-            raise CheckpointError(f"{folder} is of a run with another {what}; put the right one there, or {WAY_OUT}")
+            raise CheckpointError(f"{folder} is of a run with another {what}; {WAY_OUT}")
     path = folder / manifest["tensors"]
     try:
         content = read_regular(path)

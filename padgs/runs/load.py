@@ -32,6 +32,8 @@ from padgs.runs.store import PROGRESS, Progress, RunFolderError, RunStore, confi
 from padgs.scene import Scene, View
 from padgs.training.method import Method
 
+KEYWORDS = ("", "auto", "random", "none", "inverted")  # of points, mask and images; they name no file
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -197,8 +199,11 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
 
 
 def _found(path: str | None, folders: Iterable[Path]) -> str | None:
-    """Return a path within the first of some folders that has it; as it is if none has, as for keywords."""
-    return next((str(folder / path) for folder in folders if path and (folder / path).exists()), path)
+    """Return a path, maybe after `inverted:`, within the first of some folders that has it; if none has, as it is."""
+    prefix, colon, name = (path or "").rpartition("inverted:")
+    if prefix or name in KEYWORDS:
+        return path
+    return next((f"{colon}{folder / name}" for folder in folders if (folder / name).exists()), path)
 
 
 def missing_backends(device: str) -> set[str]:

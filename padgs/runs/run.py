@@ -52,9 +52,6 @@ class Callback:
     def started(self, folder: Path) -> None:
         """Take note of the run folder, before anything is written there."""
 
-    def saved(self, folder: Path) -> None:
-        """Take note of a new checkpoint; the log is up to date."""
-
     def stop_requested(self) -> bool:
         """Return whether the run should write its checkpoint and stop."""
         return False
@@ -70,7 +67,7 @@ def run(
     """Do what is missing of a run, and show its result.
 
     `scene` is as `load_scene(config, start(config))` returns it; loaded if None. `console` receives progress and the
-    result, if `brief` only progress; `callback` is told of the folder and of checkpoints. Errors of the input and of
+    result, if `brief` only progress; `callback` is told of the folder. Errors of the input and of
     files are `REPORTED`. Starting the run again after `Interrupted` resumes it.
     """
     scene = load_scene(config, start(config)) if scene is None else scene
@@ -97,14 +94,16 @@ def run(
         if result is None:
             method, progress = _prepared(config, scene, store, words)
             saved_at, saved, interrupted, before = time.monotonic(), progress, False, progress
-            with _Outcome(initial_result(config, scene, store.path.name), scene, before) as outcome:
+            begun, made_by = _joined(initial_result(config, scene, store.path.name), before)
+            with _Outcome(begun, scene, before) as outcome:
                 with (
                     Interrupt(callback.stop_requested) as interrupt,
                     Interrupt(store.stop.exists, STOP_SIGNALS) as stop,
                     LiveLine(console, transient=brief) as line,
                 ):
                     for record in method.fit(scene, config.time):
-                        progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
+                        spent = record.seconds, record.cpu_seconds
+                        progress = Progress(record.iteration, *spent, record.progress, made_by=made_by)
                         probed = _log(config, scene, store, record, method)
                         interrupted = interrupt.requested
                         ending = stop.requested and not (method.ended or callback.is_candidate)
@@ -114,7 +113,6 @@ def run(
                         due = due or time.monotonic() - saved_at > config.run.checkpoint_seconds
                         if interrupted or ending or due:
                             store.save(method, replace(progress, **_peaks(before, scene)))
-                            callback.saved(store.path)
                             saved_at, saved = time.monotonic(), progress
                         if interrupted:
                             break
@@ -188,7 +186,8 @@ def _prepared(config: RunConfig, scene: Scene, store: RunStore, console: Console
     """Return the method of a run with its warm start or checkpoint, and its progress; write config.yaml."""
     method = build_method(config)
     if config.init is not None and not store.has_checkpoint:
-        stress, device = config.values().get("stress"), scene.points.device
+        values, device = config.values(), scene.points.device
+        stress = {**values["stress"], "seed": config.seed} if "stress" in values else None
 
         def fingerprint_at(width: int | None) -> str:
             return load_scene(replace(config, data=replace(config.data, width=width)), device).fingerprint
@@ -246,6 +245,14 @@ def initial_result(config: RunConfig, scene: Scene, run: str) -> Result:
         config=values,
         experiments=config.labels.experiments,
     )
+
+
+def _joined(result: Result, before: Progress) -> tuple[Result, tuple[str, str]]:
+    """Return the result with all code and hardware of a resumed run, so that reports mix it with no other; and both."""
+    chip = "gpu" if result.machine["gpu"] else "cpu"
+    pairs = zip(before.made_by, (result.code_version, result.machine[chip]), strict=True)
+    code, place = (now if old in ("", now) else f"{old.removesuffix(f' then {now}')} then {now}" for old, now in pairs)
+    return replace(result, code_version=code, machine={**result.machine, chip: place}), (code, place)
 
 
 def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, method: Method) -> float | None:

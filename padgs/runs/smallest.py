@@ -55,7 +55,8 @@ class Search:
         self.run, self._result, self._stop_requested = run, run.result, stop_requested
         self._console = console
         self._load = partial(load_run, data_path=run.config.data.path, device=run.config.run.device)
-        self.shares = {view.name: candidates.band_shares(view) for view in candidates.deciding_views(run.scene)}
+        self.views = candidates.deciding_views(run.scene)
+        self.shares = {view.name: candidates.band_shares(view) for view in self.views if view.lens is None}
         self.row, self.rows = next(iter(run.method.model.counts().items()))
         self.candidates: list[candidates.Candidate] = []
 
@@ -132,7 +133,7 @@ class Search:
             "minimal": {f"{e:g}": found.index(candidates.smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
             "possible": {f"{e:g}": found.index(candidates.smallest_possible(found, e)) for e in SMALLEST_LOSSES},
             "steps": [self._described(one) for one in found],
-            "views": [*self.shares],
+            "views": [view.name for view in self.views],
             "seconds": math.fsum(one.seconds for one in found),
             "cpu_seconds": math.fsum(one.cpu_seconds for one in found),
         }

@@ -63,6 +63,7 @@ class Progress:
     share: float = 0.0  # of the schedule
     peak_memory_bytes: int = 0  # of all processes that trained; see `Result`
     peak_device_memory_bytes: int | None = None
+    made_by: tuple[str, str] = ("", "")  # code and hardware of all processes that trained
 
 
 class RunStore:

@@ -50,7 +50,7 @@ class WarmStart:
         """Return the state that the run ended with; raise a ConfigError for other data, another stress or a change.
 
         `fingerprint` is that of the scene of the new run; `fingerprint_at` returns the same for another `data.width`,
-        and is called only if the fingerprints differ; `stress` is that of the new run, as in its configuration.
+        and is called only if the fingerprints differ; `stress` is that of the new run with its seed.
         """
         store = RunStore(Path(self.run))
         try:
@@ -63,7 +63,8 @@ class WarmStart:
                     f"init={self.run} was trained on other data: images, poses, points, split and masks must be the "
                     "same, only data.width may differ; take a run on this scene, or leave init out"
                 )
-            if (other := result.config.get("stress")) != stress:
+            other = result.config.get("stress")
+            if (other := other and {**other, "seed": result.seed}) != stress:
                 raise ConfigError(
                     f"init={self.run} was trained under stress {other or 'none'}, and this run is under "
                     f"{stress or 'none'}: views, poses or units may differ; take the same stress, or leave init out"

@@ -182,6 +182,7 @@ class Corrections(nn.Module):
         super().__init__()
         self._options = options
         views = len(scene.train) if options.exposures == LEARNED else 0
+        self._panoramas = len(scene.panoramas)  # which come first
         self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
         self.poses = None if options.poses == GIVEN else PoseRefinement.of(scene.train, scale=scene.scale)
         self.lens: CameraMap | DualLens | None = None
@@ -231,9 +232,9 @@ class Corrections(nn.Module):
 
     @torch.no_grad()
     def center(self) -> None:
-        """Remove what the corrections of all views have in common; called after each optimizer step."""
+        """Remove what all views, and exposures of panoramas, have in common; called after each optimizer step."""
         for of_views in (self.log_gains, self.offsets):
-            mean = torch.stack(list(of_views)).mean(0) if of_views else 0
+            mean = torch.stack(list(of_views)[: self._panoramas]).mean(0) if of_views else 0
             for own in of_views:
                 own -= mean
         if self.poses is not None and self._options.poses == LEARNED:

@@ -42,8 +42,6 @@ def photometric_loss(
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
     """
-    if normalisation not in NORMALISATIONS:
-        raise ValueError(f"unknown normalisation {normalisation!r}; known: {', '.join(NORMALISATIONS)}")
     height, width, channels = image.shape
     if weight.shape == (height, width):  # with a mask
         visible, filling = weight[..., None] > 0, target.detach()
@@ -90,8 +88,6 @@ def pixel_weight(
     name: str, height: int, mask: Tensor | None = None, *, dtype: torch.dtype = torch.float32, device: Device = "cpu"
 ) -> Tensor:
     """Return W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without; a mask of 0 is a ValueError."""
-    if name not in ROW_WEIGHTS:
-        raise ValueError(f"unknown weight {name!r}; known: {', '.join(ROW_WEIGHTS)}")
     rows = ROW_WEIGHTS[name](height, dtype=dtype, device=device)[:, None]
     if mask is None:
         return rows

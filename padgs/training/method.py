@@ -151,6 +151,10 @@ class Method(ABC):
         rendering = self.model.render(view)
         if world is not None:
             rendering = replace(rendering, depth=rendering.depth / world.scale)
+        return self.photographed(rendering, view)
+
+    def photographed(self, rendering: Rendering, view: View) -> Rendering:
+        """Return an ideal render of a view as the learned camera would take it; the same where none is learned."""
         if self._camera is None or not isinstance(view.camera, Panorama):
             return rendering
         return self._camera.photographed(rendering)
@@ -205,6 +209,8 @@ class Method(ABC):
         """Refuse a budget that this method cannot train within on any scene; subclasses add checks."""
         if budget.gaussians is not None and not self.HAS_GAUSSIANS:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but {self._name} has no Gaussians; leave it out")
+        if budget.gaussians == "auto" and self.train_options.refine:
+            raise ValueError("budget.gaussians is auto, which prunes after growth; with train.refine=true set a number")
         if budget.stop == "auto" and self.calibrates:
             raise ValueError(
                 "budget.stop is auto, which measures validation views, but exposures or cameras are learned here, and "

@@ -161,7 +161,7 @@ def halved(view: View) -> View:
         image = pixels().float()
         small = mean(image)
         if mask is not None:
-            visible = mask()[..., None]
+            visible = mask()[..., None].to(image)
             share = mean(visible)
             small = torch.where(share > 0, mean(image * visible) / share.clamp(min=1e-6), small)
         return small.round().to(torch.uint8).contiguous()

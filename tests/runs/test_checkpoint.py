@@ -118,7 +118,7 @@ def test_an_edited_manifest_is_refused(tmp_path, change):
     manifest = json.loads((tmp_path / "state.json").read_text())
     change(manifest)
     (tmp_path / "state.json").write_text(json.dumps(manifest))
-    with pytest.raises(CheckpointError, match=r"state\.json was changed after it was written .* delete the checkpoint"):
+    with pytest.raises(CheckpointError, match=r"state\.json was changed after it was written .* delete the folder"):
         checkpoint.load(tmp_path)
 
 
@@ -127,7 +127,7 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
     checkpoint.save(example(), tmp_path, run)
     assert_same(checkpoint.load(tmp_path, run=run), example())
     for what in run:
-        with pytest.raises(CheckpointError, match=f"is of a run with another {what}; .* delete the checkpoint folder"):
+        with pytest.raises(CheckpointError, match=f"is of a run with another {what}; .* delete the folder of the run"):
             checkpoint.load(tmp_path, run={**run, what: "c"})
 
 

@@ -55,6 +55,8 @@ TOO_LATE = {
     "method=padgs method.feature_rate=-1": "feature_rate is -1.0",
     "data.format=x": "unknown format 'x'; known: auto, colmap",
     "data.dataset=x": "unknown dataset 'x'; known: roam360",
+    "+scene=synthetic_bare_room data.path=room": "+scene=synthetic_bare_room generates a scene, but data",
+    "+scene=two_lenses data.path=room": "+scene=two_lenses generates a scene, but data.path=room names",
     "data.path=": "path is ; it must be null, or not empty",
     "run.folder=": "folder is ; it must be not empty",
     "smallest=true": "unknown smallest 'true'; known: off, on",

@@ -21,6 +21,7 @@ from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
 from padgs.multirun.composition import composing, configuration
 from padgs.results import read
+from padgs.runs import load
 from padgs.runs.load import missing_backends
 from padgs.runs.run import run as train
 from padgs.runs.store import RunFolderError, config_hash
@@ -199,6 +200,15 @@ def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, mon
         assert run.scene.fingerprint == run.result.fingerprint
         run.refuse_other_data()
         assert all(view.mask() is not None for view in run.scene.train)
+
+
+def test_words_are_no_names_of_folders_and_masks_may_be_inverted(tmp_path):
+    for name in ("auto", "random", "none", "inverted", "people"):
+        (tmp_path / name).mkdir()
+    for word in ("auto", "random", "none", "inverted", "inverted:auto", "", None):
+        assert load._found(word, [tmp_path]) == word
+    assert load._found("inverted:people", [tmp_path]) == f"inverted:{tmp_path / 'people'}"
+    assert load._found("lost", [tmp_path]) == "lost"
 
 
 def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):

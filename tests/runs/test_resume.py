@@ -17,6 +17,8 @@ from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupted
 from padgs.training.health import Failure
 
+MACHINE = clock.machine()
+
 
 def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config, monkeypatch, tmp_path):
     undisturbed, _ = run(replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
@@ -51,6 +53,18 @@ def test_peak_memory_is_that_of_all_processes_that_trained(config, monkeypatch):
 
 def failing() -> None:
     raise MemoryError("for the test")
+
+
+def test_a_run_of_two_machines_and_two_versions_names_both(config, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(clock, "machine", lambda device: MACHINE | {"cpu": "Old", "commit": "a" * 40})
+        stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(Interrupted):
+            run(config)
+    monkeypatch.setattr(clock, "machine", lambda device: MACHINE | {"cpu": "New", "commit": "b" * 40})
+    result, _ = run(config)
+    assert result.machine["cpu"] == "Old then New"
+    assert result.code_version == f"{MACHINE['padgs']} {10 * 'a'} then {MACHINE['padgs']} {10 * 'b'}"
 
 
 def test_ctrl_c_in_the_last_iteration_scores_at_the_next_start(config, monkeypatch):
@@ -109,7 +123,7 @@ def test_a_checkpoint_of_another_run_is_refused(config, monkeypatch, tmp_path, c
     shutil.rmtree(folder_of(config).checkpoint)
     shutil.copytree(folder_of(other).checkpoint, folder_of(config).checkpoint)
     monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained"))
-    with pytest.raises(CheckpointError, match="is of a run with another configuration; .*delete the checkpoint folder"):
+    with pytest.raises(CheckpointError, match="is of a run with another configuration; .*delete the folder of the run"):
         run(config)
 
 

@@ -128,6 +128,10 @@ def test_other_data_and_another_checkpoint_are_refused_before_training(base, tmp
     assert not list((tmp_path / "runs").glob("*/config.yaml"))
     with pytest.raises(ConfigError, match="was trained under stress none, and this run is under .*few_views"):
         started(tmp_path / "runs", f"init={base}", "stress.condition=few_views")
+    noisy = ("stress.condition=pose_noise", "stress.level=2")
+    first = tmp_path / "runs" / started(tmp_path / "runs", *noisy).run
+    with pytest.raises(ConfigError, match="under stress .*'seed': 0}, and this run is under .*'seed': 1}"):
+        started(tmp_path / "runs", f"init={first}", *noisy, "seed=1")
     shutil.copytree(base, tmp_path / "run")
     composed = config(tmp_path / "runs", f"init={tmp_path}/run")
     state = checkpoint.load(tmp_path / "run" / "checkpoint")

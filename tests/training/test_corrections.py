@@ -13,6 +13,7 @@ from torch import nn
 from padgs.baselines.omnigs import OmniGSMethod
 from padgs.data.perturb import StressOptions
 from padgs.data.perturb.images import change_pixels
+from padgs.geometry.camera import Pinhole
 from padgs.render import RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.corrections import Corrections
@@ -81,6 +82,19 @@ def test_exposures_that_differ_are_found_but_for_their_mean():
     torch.testing.assert_close(found, stops - stops.mean(), atol=0.1, rtol=0)
 
 
+def test_panoramas_keep_their_exposure_beside_photographs():
+    scene = tiny_scene()
+    photographs = [
+        replace(view, name=f"photo-{view.name}", lens=Pinhole(32, 16, 20.0, 20.0, 16.0, 8.0)) for view in scene.train
+    ]
+    corrections = Corrections(replace(scene, train=(*scene.train, *photographs)), replace(GIVEN, exposures="learned"))
+    with torch.no_grad():
+        for own in list(corrections.offsets)[len(scene.train) :]:
+            own += 0.5  # of photographs
+    corrections.center()
+    assert torch.stack(list(corrections.offsets)[: len(scene.train)]).abs().max() == 0
+
+
 def test_poses_that_are_off_are_mended():
     exact = torch.stack([view.center for view in tiny_scene().train])
     scene = stressed("pose_noise")
@@ -129,6 +143,7 @@ def test_going_on_changes_nothing():
         (("method=padgs_ray", "train.lens=fisheyes_z"), "PaD-GS decodes others for each"),
         (("method=cubemap_3dgs", "train.lens=map"), "train.lens is map, but each of the views"),
         (("method=egonerf", "budget.gaussians=7"), "EgoNeRF has no Gaussians"),
+        (("method=omnigs", "train.refine=true", "budget.gaussians=auto"), "with train.refine=true set a number"),
     ],
 )
 def test_what_cannot_be_learned_is_refused_when_a_run_is_composed(settings, said):

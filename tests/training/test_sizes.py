@@ -4,6 +4,7 @@ from itertools import islice
 
 import pytest
 import torch
+from support.pretended_gpu import GPU, pretended_gpu
 from support.states import assert_same_but_time
 from support.tiny_scene import HEIGHT, WIDTH, tiny_scene, truth
 
@@ -45,6 +46,13 @@ def test_hidden_pixels_have_no_part_in_small_ones():
     white = replace(view, load_pixels=lambda: torch.where(view.mask()[..., None] > 0, view.load_pixels(), 255))
     assert torch.equal(halved(view).mask()[0, :3], torch.tensor([0.0, 0.5, 1.0]))
     assert torch.equal(halved(view).load_pixels()[:, 1:], halved(white).load_pixels()[:, 1:])
+
+
+def test_pixels_on_a_gpu_may_have_a_mask_on_the_cpu():
+    view = made(12, 6)
+    with pretended_gpu():
+        there = replace(view, load_pixels=lambda: view.load_pixels().to(GPU))
+        assert halved(there).load_pixels().device == GPU
 
 
 def test_a_photograph_at_half_the_size_shows_what_is_rendered_at_half_the_size():
