@@ -300,8 +300,7 @@ class _Pivot(_Builder):
         means = {factor: cell.value for factor, (cell, _) in factors.items() if cell.value is not None}
         if not means:
             return Cell()
-        method = factors[next(iter(means))][1]["method"].iloc[0]
-        near = min(means, key=lambda factor: abs(math.log(factor / law(key[0], method))))
+        near = min(means, key=lambda of: abs(math.log(of / law(key[0], factors[of][1]["method"].iloc[0]))))
         best = max(means, key=lambda factor: means[factor])
         return _by_seed(factors[near][1], factors[best][1], self.measures[0])
 

@@ -109,14 +109,15 @@ class StressedMethod:
 
     def breakdown(self, condition: str) -> int | None:
         """Return the first level below `HALF` or with a failed run; None if there is none."""
-        broken = (n for n, cell in self.levels(condition).items() if cell.status or (cell.value or 0) < HALF)
-        return next(broken, None)
+        kept = ((n, HALF if cell.value is None else cell.value) for n, cell in self.levels(condition).items())
+        return next((n for n, value in kept if value < HALF or self.levels(condition)[n].status), None)
 
     @property
     def means(self) -> list[float]:
         """Mean robustness over the levels of each condition, the worst first; empty if any stress is missing."""
-        cells = [self.levels(condition).values() for condition in {condition for condition, _ in self._scored}]
-        return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells)
+        conditions = {condition for condition, _ in self._scored}
+        cells = ([one for one in self.levels(of).values() if one.value is not None or one.status] for of in conditions)
+        return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells if of)
 
     @property
     def stability_score(self) -> float | None:

@@ -92,7 +92,8 @@ def config_of(data: str, render: RenderConfig | None = None, device: str = "auto
     """Return the configuration of a data set: a folder with keys of the `data` group, or a run, whose data it is."""
     given = {name: value for name, value in settings.items() if value}
     usual = {name: PROTOCOLS[name] for name in ("paper", "sphere")}
-    if not RunStore(Path(data)).has_checkpoint:  # other programs write a config.yaml too
+    store = RunStore(Path(data))
+    if not (store.has_checkpoint or store.has_result):  # other programs write a config.yaml too
         group = DataConfig(path=data, **{"format": "auto", **given})
         config = RunConfig(data=group, method=METHOD, options=ExternalOptions(), protocols=usual)
     elif given:
@@ -161,7 +162,8 @@ class ExternalRun(LoadedRun):
             scene = scene_without_photographs(splats, file, given.rotation).to(choose_device(device, render))
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
             raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
-        options = ExternalOptions(hashlib.sha256(file.read_bytes()).hexdigest(), as_numbers(given) if transform else "")
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        options = ExternalOptions(digest, as_numbers(given) if transform else "")
         config = config or RunConfig(render=render, method=METHOD, options=options, protocols={})
         config = replace(config, options=options)
         splats.scene_scale = scene.scale
@@ -203,7 +205,7 @@ def open_model(
             raise ValueError(f"{path} is a run, whose renderer and world are known; leave out --rays and --transform")
         if Path(path).is_file():
             kinds = f"{', '.join(SPLATS)}, and no folder of a run"
-            raise ValueError(f"{path} is no {kinds}; give one of these: splat-transform makes .ply of many formats")
+            raise ValueError(f"{path} is no {kinds}; give one of these; splat-transform makes .ply of many formats")
         return replace(load_run(path, data_path=data, device=device), opened_with=opened_with)
     config = None if data is None else config_of(data, device=device)
     run = ExternalRun.open(Path(path), config, rays, transform, device)

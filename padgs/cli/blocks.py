@@ -28,7 +28,7 @@ def split(
 
     check_range(2, 10_000, blocks=blocks)
     destination = Path(to or f"{os.path.abspath(source)}-blocks")  # also of "."
-    destination = destination.resolve() if destination.is_symlink() else destination  # of a larger disk
+    destination = destination.resolve() if destination.is_symlink() else destination  # a link may lead to a larger disk
     options = DataOptions(mask=mask, split=split, images=images or None, points=points, depth=depth)
     with name_place(destination):
         written, notes = write(Path(source), destination, blocks, format, options)

@@ -312,17 +312,18 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
             continue
+        text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
+        is_part = image.crop is not None and frame.lens is None and frame.width != image.width
+        if is_part and abs(frame.width - image.crop.width) <= 1:
+            way_out = "run padgs prepare on the images, or remove their GPano tags if those are wrong"
+            raise DataError(f"{text}, which takes a part of a panorama for the whole; {way_out}")
         if min(frame.width, frame.height) < 1 or (frame.lens is None and frame.width != 2 * frame.height):
             rule = "a full panorama is 2:1" if frame.lens is None else "a camera has pixels"
             raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; {rule}: correct its size")
-        text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
         if frame.lens is not None:
             if abs(image.width / frame.width - image.height / frame.height) > 0.01:
                 raise DataError(f"{text}; make them agree")
             continue
-        if image.crop is not None and frame.width != image.width and abs(frame.width - image.crop.width) <= 1:
-            way_out = "run padgs prepare on the images, or remove their GPano tags if those are wrong"
-            raise DataError(f"{text}, which takes a part of a panorama for the whole; {way_out}")
         scales.setdefault((frame.width, frame.height), {}).setdefault(image.width / frame.width, text)
     for of_camera in scales.values():
         if len(of_camera) > 1:

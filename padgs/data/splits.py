@@ -125,7 +125,7 @@ def spellings(name: str) -> Iterator[str]:
     >>> list(spellings("C:\\\\scan\\\\a.jpg"))
     ['C:/scan/a.jpg', 'C:/scan/a', 'scan/a.jpg', 'scan/a', 'a.jpg', 'a']
     """
-    parts = normalize("NFC", name).replace("\\", "/").split("/")
+    parts = [part for part in normalize("NFC", name).replace("\\", "/").split("/") if part not in ("", ".")]
     for start in range(len(parts)):
         end = "/".join(parts[start:])
         yield end
@@ -151,26 +151,30 @@ def _every(names: Names, every: int, mode: str) -> Split:
 
 def _resolve(lines: Names, names: Names, which: str, unposed: Names, left_out: Names) -> set[int]:
     meant: dict[str, set[int]] = {}
-    known = (*names, *left_out)
+    known, posed = (*names, *left_out, *unposed), len(names) + len(left_out)
+    folders = [_keys(name)[0].count("/") for name in known]
     for i, name in enumerate(known):
         for key in _keys(name):
             meant.setdefault(key, set()).add(i)
     meant |= {_keys(name)[0]: {i} for i, name in enumerate(known)}
-    folders = [_keys(name)[0].count("/") for name in known]
+
+    def found_in(line: str, pool: range) -> set[int]:
+        """Return the names of which the line is an end, or which are an end of it; not those that only end alike."""
+        keys = [(key, key.count("/")) for key in _keys(line)]
+        each = ({i for i in meant.get(key, ()) if i in pool and n in (keys[0][1], folders[i])} for key, n in keys)
+        return next(filter(None, each), set())
+
     chosen: set[int] = set()
     absent: list[str] = []
     for line in lines:
-        whole = _keys(line)[0].count("/")  # folders; one name must be the end of the other, not only end alike
-        each = ({i for i in meant.get(key, ()) if key.count("/") in (whole, folders[i])} for key in _keys(line))
-        found = next(filter(None, each), set())
+        found = found_in(line, range(posed))
         if len(found) > 1:
             matches = listed(known[i] for i in sorted(found))
             raise DataError(f"the {which} names {line!r}, which matches {matches}; be specific")
         if not found:
             absent.append(line)
         chosen |= found
-    there = {key for name in unposed for key in _keys(name)}
-    if without := [line for line in absent if there & set(_keys(line))]:
+    if without := [line for line in absent if found_in(line, range(posed, len(known)))]:
         raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
     if absent:
         rule = f"a line is one name, and the data set has {listed(names)}"

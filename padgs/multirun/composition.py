@@ -90,8 +90,10 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
     _refuse_changed_rows(values, choices)
     _refuse_replaced_settings(choices)
     path, scene = values.get("data", {}).get("path"), choices.get("scene")
-    if path is not None and scene is not None and "path" not in scene_choices().get(str(scene), {}).get("data", {}):
-        raise ConfigError(f"+scene={scene} generates a scene, but data.path={path} names a folder; leave out one")
+    known = scene_choices() | {file.stem: _table(file) for file in (root() / "conf" / "scene").glob("*.yaml")}
+    if path is not None and "path" not in known.get(str(scene), {}).get("data", {"path": ""}):
+        way_out = "leave out one, or add ~scene_set to an experiment that lists scenes"
+        raise ConfigError(f"+scene={scene} generates a scene, but data.path={path} names a folder; {way_out}")
     return config_from_values(values, labels(choices))
 
 

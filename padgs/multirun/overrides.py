@@ -186,7 +186,8 @@ def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLo
         texts = [override.get_value_element_as_str() if value is None else value for value in first]
         choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in dict.fromkeys(texts)]
     if len(choices.get("scene", ())) > 1 and "data.path" in choices:
-        raise ValueError(f"data.path is beside {len(choices['scene'])} scenes; for that folder alone add ~scene_set")
+        way_out = "leave out one, or add ~scene_set to an experiment that lists scenes"
+        raise ValueError(f"data.path names one folder, beside {len(choices['scene'])} scenes; {way_out}")
     if math.prod(map(len, choices.values())) > MOST_JOBS:
         raise ValueError(f"the sweep has more than {MOST_JOBS} jobs; sweep fewer values, or use several commands")
     return [list(job) for job in itertools.product(*choices.values())]

@@ -23,7 +23,7 @@ from padgs.training.model import State
 FORMAT = 1
 MANIFEST = "state.json"
 TENSORS = re.compile(r"tensors-[0-9a-f]{16}\.safetensors")
-WAY_OUT = "copy it again, take the padgs that wrote it, or delete the folder of the run to train anew"
+WAY_OUT = "copy it again, use the version of padgs that wrote it, or delete the folder of the run to train anew"
 
 
 class CheckpointError(RuntimeError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -175,7 +175,7 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
         run = {"configuration": config_hash(values)}  # the data are not read
         source, above = values["data"], (Path(), *store.path.absolute().parents)  # training began in one of these
-        source["path"] = _found(source["path"], above) if data_path is None else str(data_path)
+        source["path"] = _found(source["path"], above, ("",)) if data_path is None else str(data_path)
         source |= {
             key: _found(source[key], (Path(source["path"] or ""), *above)) for key in ("points", "mask", "images")
         }
@@ -198,10 +198,10 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     return LoadedRun(store.path, config, method, store.result(), iteration, digest)
 
 
-def _found(path: str | None, folders: Iterable[Path]) -> str | None:
+def _found(path: str | None, folders: Iterable[Path], keywords: Container[str] = KEYWORDS) -> str | None:
     """Return a path, maybe after `inverted:`, within the first of some folders that has it; if none has, as it is."""
     prefix, colon, name = (path or "").rpartition("inverted:")
-    if prefix or name in KEYWORDS:
+    if prefix or name in keywords:
         return path
     return next((f"{colon}{folder / name}" for folder in folders if (folder / name).exists()), path)
 

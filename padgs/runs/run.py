@@ -67,8 +67,8 @@ def run(
     """Do what is missing of a run, and show its result.
 
     `scene` is as `load_scene(config, start(config))` returns it; loaded if None. `console` receives progress and the
-    result, if `brief` only progress; `callback` is told of the folder. Errors of the input and of
-    files are `REPORTED`. Starting the run again after `Interrupted` resumes it.
+    result, if `brief` only progress; `callback` is told of the folder. Errors of the input and of files are `REPORTED`.
+    Starting the run again after `Interrupted` resumes it.
     """
     scene = load_scene(config, start(config)) if scene is None else scene
     store = RunStore.of(config, scene)

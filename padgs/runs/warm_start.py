@@ -67,7 +67,7 @@ class WarmStart:
             if (other := other and {**other, "seed": result.seed}) != stress:
                 raise ConfigError(
                     f"init={self.run} was trained under stress {other or 'none'}, and this run is under "
-                    f"{stress or 'none'}: views, poses or units may differ; take the same stress, or leave init out"
+                    f"{stress or 'none'}: views, poses or units may differ; take the same stress and seed, or no init"
                 )
             return checkpoint.load(store.checkpoint, device, identity(result.config, result.fingerprint))
         except (ResultError, CheckpointError) as error:

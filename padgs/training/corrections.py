@@ -2,7 +2,7 @@
 
 Held-out views have no correction of pose and exposure. A pose correction is a quaternion and a translation in the
 camera's own frame, so it turns the camera about its own center: x' = R(q) (R x + t) + scale * s. Exposures are gains
-and offsets per channel (as in URF, Rematas et al. 2022, but diagonal); their means over all views are 1 and 0.
+and offsets per channel (as in URF, Rematas et al. 2022, but diagonal); their means over panoramas are 1 and 0.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ class Corrections(nn.Module):
 
     @torch.no_grad()
     def center(self) -> None:
-        """Remove what all views, and exposures of panoramas, have in common; called after each optimizer step."""
+        """Center exposures over the panoramas, and poses over all views; called after each optimizer step."""
         for of_views in (self.log_gains, self.offsets):
             mean = torch.stack(list(of_views)[: self._panoramas]).mean(0) if of_views else 0
             for own in of_views:

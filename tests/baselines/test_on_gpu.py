@@ -26,7 +26,7 @@ ANCHORS = tuple(
     f"method.{name}={value}"
     for name, value in {
         **{"statistics_from": 0, "grow_from": 1, "grow_until": 26_250, "grow_every": 2},
-        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]", "voxel_pixels": 3},
+        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]", "voxel_pixels": 3, "max_anchors": 300},
     }.items()
 )
 # setting -> overrides that make it small, and grow; how often the host waits in an iteration without growth or
@@ -34,7 +34,10 @@ ANCHORS = tuple(
 METHODS = {
     "padgs": (ANCHORS, 8),
     "omnigs": (SPLATS, 7),
-    "padgs_plus": (("method.gradient_threshold=1e-9",), 6),  # with dropout: so short a run prunes nothing
+    "padgs_plus": (  # at the end, without dropout; so short a run prunes nothing
+        ("method.gradient_threshold=1e-9", "method.initial_per_pixel=0.2", "method.limit_per_pixel=0.8"),
+        5,
+    ),
     "sc_omnigs": (SPLATS, 7),
     "seam360gs": (SPLATS, 9),
     "cubemap_3dgs": (SPLATS, 6 * 7),  # an iteration draws six views

@@ -69,8 +69,10 @@ def test_robustness_is_the_share_above_one_colour():
 
 def test_nothing_is_kept_of_a_reference_below_one_colour():
     made = [run("padgs", 11.0), run("padgs", 9.0, "seam", 1), run("padgs", 20.0, "seam", 2)]
-    kept = cells(stability(run_set(made))[0], "Robustness")
-    assert {of["PaD-GS"] for of in kept.values()} == {"–"}
+    table, *_ = stability(run_set(made))
+    assert {of["PaD-GS"] for of in cells(table, "Robustness").values()} == {"–"}
+    assert cells(table, "Breaks at level")["seam"]["PaD-GS"] == "–"
+    assert cells(table, "synthetic-room")["stability score"]["PaD-GS"] == "–"
 
 
 def test_scores_and_breakdowns():

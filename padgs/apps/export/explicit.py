@@ -70,8 +70,8 @@ def export_run(
         if distillation_steps != DISTILLATION_STEPS:
             notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
     elif isinstance(model, AnchorModel):
-        given_from_model = (run.method.world or Similarity()).inverse()
-        _inside(given_from_model(model.anchors.centers().double().cpu()), crop)  # before the long work
+        means, world = model.anchors.centers().double(), run.method.world
+        _inside(means if world is None else world.inverse()(means), crop)  # before the long work
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
     else:
@@ -123,12 +123,13 @@ def _inside(means: Tensor, crop: Sequence[float] | None) -> Tensor | None:
 
 def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
     scene, config, method = run.scene, run.config.render, run.method
-    options, world = config.options(scene.scale), method.world or Similarity()
-    views = [view.at(world.pose(view.cam_from_world)) for view in sample_cameras(scene.train)]
+    options, world, views = config.options(scene.scale), method.world, sample_cameras(scene.train)
+    if world is not None:
+        views = [view.at(world.pose(view.cam_from_world)) for view in views]
     splats = bake(method.model.anchors, views, options, config.backend, scene.scale)
     if steps:  # on ideal renders in the world of the model
         distill(splats, method.model.render, replace(scene, train=tuple(views)), config, steps, progress)
-    if method.world is not None:
+    if world is not None:
         splats = transform_splats(splats, world.inverse())
 
     def render_splats(view: View) -> Rendering:

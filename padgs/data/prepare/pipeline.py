@@ -243,7 +243,8 @@ class _Job:
         if self.destination.exists():
             self.destination.rmdir()
         partial_folder.rename(self.destination)
-        (self.work / "images.sha256").unlink(missing_ok=True)
+        for marker in self.work.glob("*.sha256"):  # first, so that nothing resumes where only a part is deleted
+            marker.unlink()
         shutil.rmtree(self.work, ignore_errors=True)
         self.progress("result", 1, 1)
         return result

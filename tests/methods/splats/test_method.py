@@ -56,8 +56,8 @@ TUNED = {
 
 
 def test_spags_tuned_has_the_options_of_padgs_plus_that_any_method_could_have():
-    names = ("spags_tuned", "spags_supersampled", "spags_narrow", "padgs_plus")
-    tuned, supersampled, narrow, plus = (composed(f"method={name}") for name in names)
+    names = ("spags_tuned", "spags_supersampled", "spags_complete", "spags_narrow", "padgs_plus")
+    tuned, supersampled, complete, narrow, plus = (composed(f"method={name}") for name in names)
     assert tuned.options == replace(narrow.options, **TUNED)
     assert {name: getattr(plus.options, name) for name in TUNED} == TUNED
     assert (tuned.train.weight, tuned.render.low_pass, tuned.render.blending) == ("solid_angle", 0.1, "sorted")
@@ -65,6 +65,8 @@ def test_spags_tuned_has_the_options_of_padgs_plus_that_any_method_could_have():
     assert supersampled.options == replace(tuned.options, supersampling_from=plus.options.supersampling_from)
     assert supersampled.render == replace(plus.render, near_cull="ellipsoid")
     assert supersampled.train == tuned.train
+    assert complete.options == replace(supersampled.options, length_unit=plus.options.length_unit)
+    assert complete.train == replace(tuned.train, random_background=True) and complete.render == supersampled.render
 
 
 @pytest.mark.parametrize("name", ["omnigs", "odgs", "op43dgs", "cubemap_3dgs", "sc_omnigs"])
