@@ -313,8 +313,8 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
         if frame.width is None or frame.height is None:
             continue
         text = f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}"
-        is_part = image.crop is not None and frame.lens is None and frame.width != image.width
-        if is_part and abs(frame.width - image.crop.width) <= 1:
+        part = image.crop if frame.lens is None else None
+        if part is not None and abs(frame.width - part.width) <= 1 and part.width < image.width:
             way_out = "run padgs prepare on the images, or remove their GPano tags if those are wrong"
             raise DataError(f"{text}, which takes a part of a panorama for the whole; {way_out}")
         if min(frame.width, frame.height) < 1 or (frame.lens is None and frame.width != 2 * frame.height):
