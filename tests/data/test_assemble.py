@@ -1,6 +1,5 @@
 """Assembly of scenes: sizes, names, points, notes and fingerprints."""
 
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -11,14 +10,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.fixtures import World, write_colmap_text, write_transforms
+from support.fixtures import World, write_colmap_text
 from torch import Tensor
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load, read
-from padgs.data.assemble import disk_cache
-from padgs.data.capture import Cloud
+from padgs.data.assemble import _camera_notes, disk_cache
+from padgs.data.capture import Cloud, Frame
 from padgs.data.cloud import write_ply
 from padgs.data.formats import poses
+from padgs.data.images import ImageFile
+from padgs.geometry.camera import Pinhole
 
 
 @pytest.fixture
@@ -101,6 +102,13 @@ def test_images_and_cameras_of_different_size(folder: Path) -> None:
     Image.new("RGB", (64, 32)).save(folder / "images" / "pano_03.png")  # of the same camera
     with pytest.raises(DataError, match="images and cameras disagree in size: .*pano_00.png .*pano_03.png"):
         load(folder)
+
+
+def test_a_camera_of_a_photograph_without_pixels_is_refused() -> None:
+    lens = Pinhole(60, 40, 50.0, 50.0, 30.0, 20.0)
+    frame = Frame("a.jpg", Path("a.jpg"), torch.eye(4, dtype=torch.float64), width=0, height=0, lens=lambda *_: lens)
+    with pytest.raises(DataError, match="the camera of a.jpg is 0x0; a camera has pixels: correct its size"):
+        _camera_notes([frame], [ImageFile(Path("a.jpg"), 60, 40, "")])
 
 
 def test_names_that_differ_in_case_only_and_second_poses_are_refused(folder: Path) -> None:
@@ -241,71 +249,6 @@ def test_generated_scenes_need_no_path(path: str | None, format: str) -> None:
 def test_a_data_set_needs_a_path():
     with pytest.raises(DataError, match=r"data.path is not set; .* \+scene=roam360_bar"):
         load(dataset="roam360")
-
-
-@pytest.fixture
-def transforms(world: World, tmp_path: Path) -> Path:
-    write_transforms(world, tmp_path / "scene")
-    return tmp_path / "scene"
-
-
-def _name(folder: Path, old: str, new: str) -> None:
-    file = folder / "transforms.json"
-    file.write_text(file.read_text().replace(f'"{old}', json.dumps(new)[:-1]))
-
-
-@pytest.mark.parametrize(
-    "prefix",
-    ["/home/x/flat/images/", "C:\\scans\\images\\", "..\\images\\", "../../", "images\\", "./images/", "frames/"],
-)
-def test_names_are_taken_by_their_end(prefix: str, transforms: Path) -> None:
-    names = [view.name for view in load(transforms).test]
-    _name(transforms, "images/", prefix)
-    scene = load(transforms)
-    assert [view.name for view in scene.test] == names and len(scene.train) == 4
-    differs = prefix not in ("images\\", "./images/")
-    assert differs == any(note.startswith("images: 6 names differ from their files in folders") for note in scene.notes)
-
-
-def test_names_without_image_say_what_differs(transforms: Path) -> None:
-    _name(transforms, "images/pano_00", "/home/x/else")
-    with pytest.raises(
-        DataError, match="names '/home/x/else.png'; names must be relative .*remove the leading folders"
-    ):
-        load(transforms)
-    _name(transforms, "/home/x/else", "/home/x/pano_01")
-    with pytest.raises(DataError, match="names '/home/x/pano_01.png'; names must be relative"):
-        load(transforms)  # the image of another frame
-
-
-def test_smaller_copies_and_other_extensions(world: World, transforms: Path) -> None:
-    (transforms / "images_2").mkdir()
-    for name, image in zip(world.names, world.images, strict=True):
-        Image.fromarray(image[::2, ::2]).save(transforms / "images_2" / f"{name}.JPG")
-    scene = load(transforms, images="images_2")
-    assert scene.train[0].width == 32 and [view.name for view in scene.test] == list(world.test)
-    assert any("'pano_00.png' is images_2/pano_00.JPG" in note for note in scene.notes)
-
-
-def test_unicode_forms_of_names(folder: Path) -> None:
-    composed, decomposed = "k\u00fcche", "ku\u0308che"
-    for path in (folder / "images").iterdir():
-        path.rename(path.with_name(path.name.replace("pano", decomposed)))
-    for file in ("sparse/0/images.txt", "train.txt", "test.txt"):
-        (folder / file).write_text((folder / file).read_text().replace("pano", composed), encoding="utf-8")
-    (folder / "masks").mkdir()
-    Image.new("L", (64, 32), 200).save(folder / "masks" / f"{composed}_01.png")
-    scene = load(folder)
-    assert [view.name for view in scene.test] == [f"{decomposed}_01", f"{decomposed}_04"]
-    assert scene.test[0].mask() is not None
-
-
-def test_two_files_for_one_name_are_not_chosen_from(transforms: Path) -> None:
-    for extension in ("webp", "bmp"):
-        shutil.copy(transforms / "images/pano_00.png", transforms / f"images/other.{extension}")
-    _name(transforms, "images/pano_00", "images/other")
-    with pytest.raises(DataError, match="'other.png' of the transforms data set may be other.bmp, other.webp; remove"):
-        load(transforms)
 
 
 def test_images_that_the_disk_cache_holds_do_not_count_against_it(tmp_path, monkeypatch):

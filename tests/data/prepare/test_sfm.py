@@ -85,6 +85,18 @@ def test_threads_are_limited_by_free_memory(monkeypatch):
     assert work.threads_for(2048, 1024) == 1
 
 
+def test_a_working_folder_that_is_half_deleted_is_not_resumed(tmp_path, monkeypatch):
+    folder = work.WorkFolder(tmp_path / "work")
+    folder.open("images", "old")
+    folder.run_once("features", lambda: None)
+    (tmp_path / "work" / "views").mkdir()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(work.shutil, "rmtree", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        folder.open("images", "new")
+    folder.open("images", "old")
+    assert [path.name for path in (tmp_path / "work").iterdir()] == ["images.sha256"]
+
+
 def test_files_are_copied_on_file_systems_without_links(tmp_path, monkeypatch):
     original = tmp_path / "original.png"
     original.write_bytes(b"a picture")
