@@ -59,9 +59,7 @@ class ODGSMethod(SplatMethod):
         super()._refuse_impossible()
         if self.options.extent_margin and self.options.length_unit != "extent":
             margin, unit = self.options.extent_margin, self.options.length_unit
-            raise ValueError(
-                f"method.extent_margin={margin} is added to the extent, not used with length_unit={unit}: set 0"
-            )
+            raise ValueError(f"method.extent_margin={margin} is added to the extent, not to length_unit={unit}: set 0")
         if self.options.pixel_bias and self.render_config.projection != "erp":
             raise ValueError(
                 f"method.pixel_bias is a deviation of render.projection=erp, not {self.render_config.projection}; "

@@ -66,9 +66,7 @@ class Cubemap3DGSMethod(SplatMethod):
 
     def refuse_search(self) -> None:
         """Refuse: a panorama that is held out would be cut into views, of which most are trained on."""
-        raise ValueError(
-            "views are cut from all panoramas, so none can be held out for the search; take a method without cuts"
-        )
+        raise ValueError("views are cut from all panoramas: none can be held out for the search; take another method")
 
     def _refuse_impossible(self) -> None:
         if self.render_config.projection == "pinhole" and not self.render_config.cubemap:
@@ -80,9 +78,7 @@ class Cubemap3DGSMethod(SplatMethod):
             weight = self.train_options.weight
             raise ValueError(f"train.weight is {weight}, but perspective views have no latitude; set uniform")
         if self.train_options.depth_weight:
-            raise ValueError(
-                "train.depth_weight is not 0, but views that are cut from panoramas have no depth map; set 0"
-            )
+            raise ValueError("train.depth_weight is not 0, but views that are cut from panoramas have no depth; set 0")
         for learned in ("exposures", "poses", "lens"):
             if (choice := getattr(self.train_options, learned)) != GIVEN:
                 raise ValueError(

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -61,9 +62,7 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def measure(
-    work: Callable[[], object], *, repeats: int = 10, warm_up: int = 2, device: Device = "cpu"
-) -> dict[str, Any]:
+def measure(work: Callable[[], Any], *, repeats: int = 10, warm_up: int = 2, device: Device = "cpu") -> dict[str, Any]:
     """Time `work()` several times: {"repeats": n, "wall": {"median", "p95", "min"}, "cpu": {the same}} in seconds."""
     for _ in range(warm_up):
         work()
@@ -126,9 +125,14 @@ def machine(device: Device = "cpu") -> dict[str, Any]:
         "torch": torch.__version__,
         "cuda": torch.version.cuda if gpu else None,
         "padgs": metadata.version("padgs"),
-        "commit": commit(),
+        "commit": _commit_at_start(),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
+
+
+@cache
+def _commit_at_start() -> str | None:
+    return commit()  # later the files may be of another commit than the running code
 
 
 def commit(folder: Path | None = None) -> str | None:

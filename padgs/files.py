@@ -12,8 +12,9 @@ import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING
+from unicodedata import normalize
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -163,3 +164,14 @@ def _format_of(file: Path | IO[bytes]) -> str:
             if accepts is not None and accepts(start[:16]):
                 return name
     return "of an unknown format"
+
+
+def folded(path: Path | PurePosixPath | str) -> str:
+    """Return a path as it is compared: without case, in one Unicode form."""
+    return normalize("NFC", PurePosixPath(path).as_posix()).casefold()
+
+
+def given_path(given: str, folder: Path) -> Path:
+    """Return the path that an option names: from the data set's folder, or else from the working directory."""
+    inside, here = folder / given, Path(given).absolute()
+    return here if here.exists() and not inside.exists() else inside

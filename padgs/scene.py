@@ -102,26 +102,23 @@ class Scene:
             return replace(self, points=self.points.float())
         step = 2.0 ** round(math.log2(self.scale) - 10)  # processors differ in the last bits, and agree in these steps
         middle = (middle / step).round() * step
-        train, test = (
-            tuple(replace(view, cam_from_world=move_origin(view.cam_from_world, middle)) for view in views)
-            for views in (self.train, self.test)
-        )
+        moved = self.with_views(lambda view: replace(view, cam_from_world=move_origin(view.cam_from_world, middle)))
         points = (self.points.double() - middle.to(self.points.device)).float()
         text = ", ".join(f"{number:.10g}" for number in middle.tolist())
         note = f"world: origin moved to ({text}), because the cameras are {distance:.0f} scene scales away from it"
         origin, notes = self.origin + middle.to(self.origin), (*self.notes, note)
-        return replace(self, train=train, test=test, points=points, origin=origin, notes=notes)
+        return replace(moved, points=points, origin=origin, notes=notes)
 
     def to(self, device: torch.device | str) -> Scene:
         """Return the scene with poses and points on a device; pixels are loaded on access."""
         if self.points.device == torch.device(device):
             return self
-        train, test = (
-            tuple(replace(view, cam_from_world=view.cam_from_world.to(device)) for view in views)
-            for views in (self.train, self.test)
-        )
-        points, colors = self.points.to(device), self.point_colors.to(device)
-        return replace(self, train=train, test=test, points=points, point_colors=colors)
+        moved = self.with_views(lambda view: replace(view, cam_from_world=view.cam_from_world.to(device)))
+        return replace(moved, points=self.points.to(device), point_colors=self.point_colors.to(device))
+
+    def with_views(self, change: Callable[[View], View]) -> Scene:
+        """Return the scene with all training views changed, and then all test views."""
+        return replace(self, train=tuple(map(change, self.train)), test=tuple(map(change, self.test)))
 
     @property
     def panoramas(self) -> tuple[View, ...]:

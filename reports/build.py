@@ -122,8 +122,8 @@ class _Builder:
 
     def _blocks(self, title: str, place: Place, runs: DataFrame) -> Iterator[Block]:
         spec = self.spec
-        if spec.equal_images is not None:
-            self.unranked.append(unranked(runs, equal_images=spec.equal_images))
+        if spec.unranked:
+            self.unranked.append(unranked(runs))
         if spec.rows in ("run", "setting"):
             yield Block(title, self._ranked(runs, title) if spec.by_rank else tuple(self._each_run(runs)))
             return
@@ -197,7 +197,7 @@ class _Builder:
             heading += f": {', '.join(place.label for place in places)}"
         heading = ", ".join([heading, *values])
         refuse_mixture(runs, self.request, title or heading, [of for of in self.spec.shared if of != "data"])
-        self.unranked.append(unranked(runs, equal_images=self.spec.equal_images is not False))
+        self.unranked.append(unranked(runs))
         titles, cells, theirs = self._titles(Place(places[0].dataset, AVERAGE), runs), {}, {}
         settings = without_data(runs)
         for preset, words in titles.items():
@@ -232,11 +232,13 @@ class _Builder:
 
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
         """Return a row for each setting, the best first, those without a number last."""
-        every = [(one.title, one_setting(one.runs, f"{where}, {one.title}")) for one in settings(runs)]
-        found = [(title, over_seeds(own, self.measures)) for title, own in every]
+        found, not_ranked = [], self.unranked[-1]
+        for one in settings(runs):
+            row = over_seeds(one_setting(one.runs, f"{where}, {one.title}"), self.measures)
+            found.append((one.title, unrank(row) if one.preset in not_ranked else row))
         sign = -1.0 if self.direction else 1.0
         found.sort(key=lambda row: (row[1][0].value is None, sign * (row[1][0].value or 0.0)))
-        cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
+        cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None and row[0].ranked}
         separable = not any(map(is_few, cells.values()))
         shared = places(cells, self.measures[0].column) if separable else []
         ranks = {i: Cell(1 + sum(map(len, shared[:place])), count=0) for place, rows in enumerate(shared) for i in rows}

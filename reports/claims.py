@@ -208,7 +208,10 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
     if claim.scenes:
         runs = runs.loc[[place.outdoor is (claim.scenes == "outdoor") for place in runs["place"]]]
     ours, others = claim.sides
-    shared = ("place", "resolution", "length", "data", *(("machine",) if claim.metric in COSTS else ()))
+    timed = runs.reindex(columns=[f"{CONFIG}budget.seconds"]).notna().any(axis=1)
+    # Costs depend on the machine, and so does what a run of a minute becomes
+    runs = runs.assign(apart=runs["machine"].where(timed | (claim.metric in COSTS), ""))
+    shared = ("place", "resolution", "length", "data", "apart")
     best: dict[tuple[str, ...], dict[str, Any]] = {}
     for (place, size, length, *_), alike in grouped(runs, *shared) if len(runs) else ():
         where = f"{claim.text}, {place.scene}, {size}, {length}"

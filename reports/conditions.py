@@ -106,11 +106,12 @@ def _values(runs: DataFrame, what: str) -> pd.Series:
     return runs[what].dropna() if what in runs else pd.Series(dtype=object)
 
 
-def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, tuple[str, str]]:
-    """Return preset -> (reason, numbers) of those not to be ranked, after equal images (`equal_images`) or time."""
+def unranked(runs: DataFrame) -> dict[str, tuple[str, str]]:
+    """Return preset -> (reason, numbers) of those not to be ranked; after equal time no number of images is too few."""
     found: dict[str, tuple[str, str]] = {}
+    timed = runs.reindex(columns=[f"{CONFIG}budget.seconds"]).notna().any(axis=None)
     seen = runs.loc[runs["ok"]].groupby("preset")["images"].mean()
-    for preset, images in seen[seen < LEAST_SHARE * seen.max()].items() if equal_images else ():
+    for preset, images in seen[seen < LEAST_SHARE * seen.max()].items() if not timed else ():
         found[str(preset)] = FEWER_IMAGES, f"{images:.0f} of {seen.max():.0f} images"
     for method, keys in CALIBRATES.items():
         if (own := runs.loc[runs["method"] == method]).empty:

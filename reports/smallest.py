@@ -12,6 +12,7 @@ from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, 
 from padgs.reports.conditions import OF_TIMES, footnotes, sheets
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import mean_cell
+from padgs.reports.specs import SPECS
 from padgs.reports.table import Block, Column, Row, Table
 from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURED, SMALLEST_STATED
 
@@ -109,7 +110,7 @@ def table(run_set: RunSet) -> Table:
             rows.append(Row(method, tuple(map(mean_cell, known))))
         blocks.append(Block(title, tuple(rows)))
         shown[title] = own
-    notes = (*footnotes(shown, run_set.request.protocol), *NOTES) if blocks else ()
+    notes = (*footnotes(shown, run_set.request.protocol), *NOTES, *SPECS["table3"].notes) if blocks else ()
     return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
 
 

@@ -37,7 +37,7 @@ class Spec:
     titles: str = ""  # key of `TITLES`; empty: all presets
     difference: str = ""  # note on a column with the difference of each PSNR from the first row's
     by_rank: bool = False  # sort by the first measure, and add a column of ranks
-    equal_images: bool | None = None  # leave out of the ranking: see `conditions.unranked`; None: nothing
+    unranked: bool = False  # leave presets out of the ranking: see `conditions.unranked`
     # Columns of the paper, and notes
     paper: Mapping[str, int] = field(default_factory=dict)  # data set -> table of the paper
     averages: bool = False  # blocks with the means over each data set of `paper`, and over all other scenes

@@ -98,5 +98,12 @@ def test_the_commit_is_that_of_the_checkout(tmp_path):
     assert clock.commit(tmp_path) == git("rev-parse", "HEAD") + "+"
 
 
+def test_measurements_have_the_commit_of_the_running_code(monkeypatch):
+    """Later the checkout may have another one, or files that differ from it."""
+    started = clock.machine()["commit"]
+    monkeypatch.setattr(clock, "commit", lambda: "0123456789+")
+    assert clock.machine()["commit"] == started != "0123456789+"
+
+
 def _root() -> str:
     return clock.__file__.rsplit("/", 2)[0]

@@ -84,9 +84,7 @@ def plan(capture: Capture, scene: Scene, count: int) -> Plan:
     from scipy.spatial import KDTree
 
     if capture.cloud is None or not len(capture.cloud.points):
-        raise DataError(
-            f"{capture.folder} has no point cloud, and cameras of a block share points; name one by data.points"
-        )
+        raise DataError(f"{capture.folder} has no points, which cameras of a block share; name a cloud by data.points")
     poses = {view_name(frame.name): frame.cam_from_world for frame in capture.frames}
     train, test = ([replace(v, cam_from_world=poses[v.name]) for v in side] for side in (scene.train, scene.test))
     if not 2 <= count <= len(train) // 2:

@@ -23,13 +23,13 @@ from torch import Tensor
 import padgs.data
 from padgs.apps.block_plan import plan, sphere_share
 from padgs.data.assemble import assemble
-from padgs.data.capture import Cloud, DataError, DataOptions, given_path, listed, view_name
+from padgs.data.capture import Cloud, DataError, DataOptions, listed, view_name
 from padgs.data.depths import write_depths
 from padgs.data.formats.json_file import read_json
 from padgs.data.formats.transforms import REDUCED
 from padgs.data.formats.writers import Content, write_transforms
 from padgs.data.masks import write_masks
-from padgs.files import draft_of
+from padgs.files import draft_of, given_path
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of
 from padgs.results import flat

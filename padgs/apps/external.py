@@ -161,7 +161,8 @@ class ExternalRun(LoadedRun):
         if scene is None:
             scene = scene_without_photographs(splats, file, given.rotation).to(choose_device(device, render))
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
-            raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; add --rays exact")
+            way_out = "leave them out (padgs score --cameras panoramas), or add --rays exact"
+            raise ValueError(f"--rays ewa draws panoramas, and {listed(others)} are photographs; {way_out}")
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
         options = ExternalOptions(digest, as_numbers(given) if transform else "")
         config = config or RunConfig(render=render, method=METHOD, options=options, protocols={})

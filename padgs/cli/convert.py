@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Depth, Images, Mask, Points, Split, check_range, show
+from padgs.cli.errors import OF_DATA, Depth, Images, Mask, Points, Split, as_options, check_range, show
 from padgs.cli.prepare import CameraHeight, Gps, Metres
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, released"
@@ -49,6 +49,6 @@ def convert(
             progress=lambda done, total: status.update(f"image {done} of {total}"),
         )
     for note in scene.notes:
-        show(f"  {note}")
+        show(f"  {note if 'train on' in note else as_options(note, OF_DATA)}")  # training has no such options
     views = f"{len(scene.train)} train and {len(scene.test)} test views, {len(scene.points)} points"
     show(f"{destination}: {views}, as {to}")

@@ -12,8 +12,11 @@ def export(
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
     smooth: Annotated[bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html does")] = False,
+    degree_3: Annotated[
+        bool, typer.Option("--degree-3", help="zeros for higher harmonics in the .ply; some programs read no others")
+    ] = False,
     distillation_steps: Annotated[
-        int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
+        int | None, typer.Option(help="iterations that fit Gaussians to renders of PaD-GS or padgs+; default 300")
     ] = None,
     crop: Annotated[
         str, typer.Option(help="box of the scene to keep, six numbers: lowest and highest x y z; padgs view shows them")
@@ -58,8 +61,8 @@ def export(
         )
         status.update(Text(f"writing {printable(path.name)}"))
         with name_place(path):
-            lost = write_splats(path, found.splats, found.notes, start=found.start)
-    notes = [note for note in (*found.notes, lost) if note and (smooth or note != UNSMOOTHED)]
+            lost = write_splats(path, found.splats, found.notes, start=found.start, degree_3=degree_3)
+    notes = [note for note in (*trained.notes, *found.notes, lost) if note and (smooth or note != UNSMOOTHED)]
     show("\n".join(f"  {note}" for note in notes))
     show(f"{path}: {len(found.splats)} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from padgs.cli.errors import MAX_SEED, MAX_THREADS, Mask, check_range, show
+from padgs.cli.errors import MAX_SEED, MAX_THREADS, Mask, as_options, check_range, show
 from padgs.runs.interrupt import Interrupted
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def prepare(
     print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)
     for note in (*result.notes, spent) if spent else result.notes:
-        show(f"  {note}")
+        show(as_options(f"  {note}", ["mask"]))
     end_with(report, ["mask"])
 
 

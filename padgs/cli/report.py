@@ -21,7 +21,7 @@ def report(
     out: Annotated[str, typer.Option(help="folder of the files; default: reports in or beside RUNS")] = "",
     protocol: Annotated[str, typer.Option(help="rules of scoring: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
-    metric: Annotated[list[str] | None, typer.Option(help="only these metrics, e.g. ws_psnr; repeatable")] = None,
+    metric: Annotated[list[str] | None, typer.Option(help="only these of the protocol, e.g. psnr; repeatable")] = None,
     method: Annotated[list[str] | None, typer.Option(help="only these methods, e.g. odgs,padgs*; repeatable")] = None,
     scene: Annotated[list[str] | None, typer.Option(help="only these scenes or data sets, as a,b; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
@@ -67,12 +67,15 @@ def report(
             show(f"{'error' if single or strict else 'left out'}: {name}: {error}", sys.stderr)
             if single:
                 raise typer.Exit(1) from error
-            for ending in ("md", "tex", "csv"):  # an old table must not lie beside new ones
-                (target / f"{name}.{ending}").unlink(missing_ok=True)
-            continue
+            texts = {}
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
+        is_table = not REPORTS[name].function.endswith(
+            ("charts", ":html")
+        )  # the user may have a chart.csv or gallery.md
         with name_place(target, "--out"):
+            for ending in ("md", "tex", "csv") if is_table and f"{name}.md" not in texts else ():
+                (target / f"{name}.{ending}").unlink(missing_ok=True)  # an old table must not lie beside new ones
             write_files(texts, target)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())

@@ -41,6 +41,7 @@ def view(
         place = data or next((folder for folder in folders if folder not in files), None)
         for folder in folders:
             wait_for_checkpoint(folder)
+        for folder in folders:
             stated = (rays, transform) if folder in files or not files else ()  # a run beside a file has its own
             runs.append(open_model(folder, place if folder in files else data, *stated))
             for note in runs[-1].notes:

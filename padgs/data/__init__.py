@@ -10,11 +10,12 @@ from pathlib import Path
 
 from padgs.checks import lookup
 from padgs.data.assemble import assemble, found_images
-from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, given_path
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions
 from padgs.data.cloud import NO_FILE, read_cloud
 from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
+from padgs.files import given_path
 from padgs.scene import Scene
 
 # `read(path, options) -> Capture`, except synthetic, which reads no files: `load(path, options) -> Scene`.

@@ -13,19 +13,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import (
-    OTHERS,
-    Capture,
-    DataError,
-    DataOptions,
-    Frame,
-    UnknownLens,
-    first_of,
-    folded,
-    given_path,
-    listed,
-    view_name,
-)
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed, view_name
 from padgs.data.cloud import initial_cloud
 from padgs.data.depths import FOLDERS as DEPTH_FOLDERS
 from padgs.data.depths import with_depths
@@ -34,7 +22,7 @@ from padgs.data.masks import find_masks, is_of_masks, masks_beside
 from padgs.data.metres import unit_note
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage, cache_root
-from padgs.files import file_name
+from padgs.files import file_name, folded, given_path
 from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 

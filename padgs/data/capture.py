@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
-from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -39,17 +38,6 @@ def listed(names: Iterable[object], most: int = 5) -> str:
     names = [str(name) for name in names]
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
-
-
-def folded(path: Path | PurePosixPath | str) -> str:
-    """Return a path as it is compared: without case, in one Unicode form."""
-    return normalize("NFC", PurePosixPath(path).as_posix()).casefold()
-
-
-def given_path(given: str, folder: Path) -> Path:
-    """Return the path that an option names: from the data set's folder, or else from the working directory."""
-    inside, here = folder / given, Path(given).absolute()
-    return here if here.exists() and not inside.exists() else inside
 
 
 def by_id(pairs: Iterable[tuple[Any, Any]], where: str) -> dict[Any, Any]:

@@ -13,7 +13,7 @@ import padgs.data
 from padgs.data import conventions
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, path_length
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, Progress, listed, view_name
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Progress, listed, natural_key, view_name
 from padgs.data.cloud import GREY_POINTS
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
@@ -91,22 +91,22 @@ def check(
     report.resolution = listed(f"{width}x{height}" for width, height in sizes)
     report.notes += scene.notes
     report.gravity = gravity(poses)
-    ordered = sorted(used, key=lambda frame: frame.name)
+    ordered = sorted(used, key=lambda frame: natural_key(frame.name))
     report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
     report.median_depth = scene.scale
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
-    if hidden := [f"{name} ({share:.1%})" for name, share in report.masked.items() if share > MAX_HIDDEN]:
+    if hidden := [f"{view.name} ({share:.1%})" for view in views if (share := _hidden(view)) > MAX_HIDDEN]:
         text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "
         text += "255 means use, 0 means ignore: repair them, or set data.mask to none, inverted or a folder"
         (report.problems if options.mask == "auto" else report.notes).append(text)
     _check_leaks(scene, digests, report)
-    if report.path_length == 0 and len(poses) > 1:
+    if len(views) > 1 and replace(scene, train=views).has_single_center:
         report.problems.append("all cameras have the same centre; depth cannot be learned")
     if damaged:  # the fit needs readable pixels
         return report
     scene = replace(scene, train=scene.panoramas, test=tuple(view for view in scene.test if view.lens is None))
     _check_fit(capture, scene, report)
-    if capture.cloud is not None:
+    if capture.cloud is not None and not any("random points" in note for note in scene.notes):
         _check_depth(scene, report)
     if overlay is not None:
         try:
@@ -115,6 +115,14 @@ def check(
         except DataError as error:
             report.problems.append(str(error))
     return report
+
+
+def _hidden(view: View) -> float:
+    """Return the share that a mask file hides of what the picture, maybe a part of a panorama, shows."""
+    if (mask := view.mask()) is None:
+        return 0.0
+    pictured = getattr(view.load_mask, "fixed", None)
+    return 1 - mask.mean().item() / (1.0 if pictured is None else pictured.mean().item())
 
 
 def _check_depth(scene: Scene, report: Report) -> None:

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.data.camera_paths import centers
-from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, first_of, given_path, refuse_special
-from padgs.files import atomic_path
+from padgs.data.capture import FARTHEST, Capture, Cloud, DataError, first_of, refuse_special
+from padgs.files import atomic_path, given_path
 from padgs.geometry.harmonics import DC
 
 CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # names of colours, after one of the prefixes; any case
@@ -211,7 +212,14 @@ def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
     return Cloud(middle + spread * radius * direction, None)
 
 
-def first_ply(folder: Path, names: tuple[str, ...]) -> Cloud | None:
-    """Read the first of the named PLY files that exists in a folder; None if there is none."""
+def first_ply(folder: Path, names: tuple[str, ...], source: str = "auto") -> Cloud | None:
+    """Read the first of the named PLY files that a folder has; None if there is none. `source`: see `forgiving`."""
     files = (first_of((folder / name).parent, (Path(name).name,)) for name in names)
-    return next((read_ply(file) for file in files if file), None)
+    with forgiving(source):
+        return next((read_ply(file) for file in files if file), None)
+    return None
+
+
+def forgiving(source: str) -> AbstractContextManager[object]:
+    """Return a context in which a damaged cloud does not matter if `source`, that is `data.points`, is another."""
+    return nullcontext() if source == "auto" else suppress(DataError)

@@ -41,11 +41,14 @@ class Convention(NamedTuple):
 def colour_fit(poses: Tensor, images: Tensor, points: Tensor, colors: Tensor) -> float:
     """Return the correlation of the colours of points [P, 3] and their pixels; 1 = equal, about 0 = unrelated.
 
-    `poses` are cam_from_world [F, 4, 4], `images` [F, H, W, 3] and `colors` [P, 3] uint8; few hundred pixels do.
+    `poses` are cam_from_world [F, 4, 4], `images` [F, H, W, 3] and `colors` [P, 3] uint8; few hundred pixels do. Black
+    pixels, of which a part of a panorama consists elsewhere, do not count.
     """
     found = _pixels(poses, images, points)
     colors = colors[:: max(1, len(points) // POINTS)].float().expand_as(found)
-    a, b = (values - values.mean(1, keepdim=True) for values in (found, colors))
+    seen = (found.amax(-1, keepdim=True) > 0).float()
+    count = seen.sum(1, keepdim=True).clamp(min=1)
+    a, b = ((values - (values * seen).sum(1, keepdim=True) / count) * seen for values in (found, colors))
     return ((a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1)).clamp(min=1e-6)).mean().item()
 
 

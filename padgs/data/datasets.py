@@ -1,5 +1,6 @@
 """Published panoramic data sets of datasets.yaml: their scenes, sources and folders."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +49,7 @@ DATASETS = _read()
 
 def refuse_missing(path: Path, dataset: str | None) -> None:
     """Refuse a missing folder, and say how to get a known data set."""
-    if path.exists():
+    if os.path.exists(path):  # False behind a closed folder
         return
     likely = [key for key, known in DATASETS.items() if known.scene_at(path)]
     likely.sort(key=lambda key: DATASETS[key].folder != path.parent.name.casefold())  # two data sets have a "center"
@@ -63,7 +64,7 @@ def refuse_missing(path: Path, dataset: str | None) -> None:
         )
     what, folder, holds = f"the scene {scene!r} of {known.title}", path, "this folder holds"
     top = path.parents[known.nested]
-    if not top.exists():  # the same message for all scenes, which a multirun prints once
+    if not os.path.exists(top):  # the same message for all scenes, which a multirun prints once
         what, folder, holds = known.title, top, "the folder of each scene holds"
     raise DataError(
         f"{what} is missing. Get it from {known.source}, and put it into {folder.absolute()}, so that {holds} "

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.checks import install_command
-from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, first_of, folded, listed
+from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, first_of, listed
 from padgs.data.images import read_bytes, refused_if_damaged
-from padgs.files import open_image
+from padgs.files import folded, open_image
 from padgs.scene import View
 
 FOLDERS = ("depths", "depth")
@@ -68,9 +68,7 @@ class Depth:
         return depth
 
 
-def with_depths(
-    views: Sequence[View], capture: Capture, options: DataOptions
-) -> tuple[list[View], list[str], list[str]]:
+def with_depths(views: list[View], capture: Capture, options: DataOptions) -> tuple[list[View], list[str], list[str]]:
     """Return the views of the capture's frames with `load_depth`, digests of the files, and notes.
 
     Maps are held in memory if all fit into `cache_bytes`; else they are read on each access. A DataError says that a
@@ -78,7 +76,7 @@ def with_depths(
     """
     files, meaning, notes = ({}, None, []) if options.depth == "none" else _depth_files(capture)
     if meaning is None:
-        return list(views), [], notes
+        return views, [], notes
     made, digests, sizes, total = list(views), [f"{meaning.measure}{meaning.unit}"], set(), 0
     for i, (view, frame) in enumerate(zip(views, capture.frames, strict=True)):
         if (file := files.get(frame.name)) is None:

@@ -14,10 +14,11 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture, DataError, first_of, folded, given_path, listed
+from padgs.data.capture import Capture, DataError, first_of, listed
 from padgs.data.image_metadata import Crop
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
+from padgs.files import folded, given_path
 from padgs.geometry.distortion import solid_angle_weight
 
 SCENE_MASKS = ("mask.png", *(f"mask{extension}" for extension in EXTENSIONS))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from padgs.data.camera_paths import centers, gravity
 from padgs.data.capture import Cloud, DataError, Frame, listed, view_name
-from padgs.files import open_image
+from padgs.files import folded, open_image
 from padgs.geometry.similarity import Similarity
 
 UNIT, Z = "unit.json", (0.0, 0.0, 1.0)
@@ -89,8 +89,9 @@ def unit_note(folder: Path) -> list[str]:
 
 def named(panoramas: Sequence[str], *names: str) -> list[int]:
     """Return which panoramas the names of --metres are; a DataError for one that has no pose."""
-    at = {name: k for k, full in enumerate(panoramas) for name in (full, view_name(full))}
-    keys = [name if name in at else view_name(name) for name in names]  # "convert" may change the extension
+    at = {folded(name): k for k, full in enumerate(panoramas) for name in (full, view_name(full))}
+    # "convert" may change the extension.
+    keys = [folded(name) if folded(name) in at else folded(view_name(name)) for name in names]
     if unknown := [name for name, key in zip(names, keys, strict=True) if key not in at]:
         raise DataError(f"--metres: no panorama with a pose is called {unknown[0]!r}; known: {listed(panoramas)}")
     return [at[key] for key in keys]
@@ -103,15 +104,13 @@ def refuse_useless(known: KnownLength, images: Mapping[str, Path]) -> None:
         _gps_places([*images.values()])
 
 
-def _by_distance(
-    frames: Sequence[Frame], poses: Tensor, first: str, second: str, metres: float
-) -> tuple[Similarity, str]:
-    at = named([frame.name for frame in frames], first, second)
+def _by_distance(frames: Sequence[Frame], poses: Tensor, a: str, b: str, metres: float) -> tuple[Similarity, str]:
+    at = named([frame.name for frame in frames], a, b)
     distance = (centers(poses)[at[0]] - centers(poses)[at[1]]).norm().item()
     extent = (centers(poses) - centers(poses).mean(0)).norm(dim=1).max().item()
     if distance <= 1e-6 * extent:
-        raise DataError(f"--metres: {first} and {second} were taken at one place; name two cameras far apart")
-    return Similarity(metres / distance), f"by {metres:g} m between {first} and {second}"
+        raise DataError(f"--metres: {a} and {b} were taken at one place; name two cameras far apart")
+    return Similarity(metres / distance), f"by {metres:g} m between {a} and {b}"
 
 
 def _common_up(poses: Tensor, option: str) -> Tensor:
@@ -145,7 +144,8 @@ def _by_height(poses: Tensor, cloud: Cloud | None, metres: float) -> tuple[Simil
         )
     best = int(np.argmax(np.where(fits, inside, 0)))
     height = float(np.median(below[low[best] : high[best]]))
-    near = torch.cdist(cameras[:, :2], points[low[best] : high[best], :2]).amin(1) < height
+    floor = points[low[best] : high[best], :2]  # of millions of points, perhaps: one camera at a time
+    near = torch.stack([(floor - camera).norm(dim=1).min() for camera in cameras[:, :2]]) < height
     if near.double().mean() < _MIN_ABOVE_FLOOR:
         raise DataError(
             f"--camera-height: no floor was found: the lowest layer, of {inside[best]} points, lies under only "

@@ -141,10 +141,7 @@ def _keys(name: str) -> list[str]:
 def _every(names: Names, every: int, mode: str) -> Split:
     test = tuple(range(0, len(names), every))
     if not (train := tuple(i for i in range(len(names)) if i % every)):
-        raise DataError(
-            f"{len(names)} posed view(s) cannot be split; at least 2 are needed, to train and to test "
-            "on: set data.split=all"
-        )
+        raise DataError(f"{len(names)} posed view(s) cannot be split; at least 2 are needed: set data.split=all")
     why = "no train.txt or test.txt" if mode == "auto" else "data.split=every"
     return Split(train, test, (f"split: every {every}th view is a test view ({why})",))
 

@@ -25,12 +25,7 @@ Render = Callable[[View], Rendering]
 
 
 def score(
-    render: Render,
-    scene: Scene,
-    protocols: Mapping[str, Protocol],
-    save_image: OnView | None,
-    *,
-    calibrates: bool = False,
+    render: Render, scene: Scene, protocols: Mapping[str, Protocol], save: OnView | None, *, calibrates: bool = False
 ) -> dict[str, Scores]:
     """Return the scores of the test views under each protocol; images are saved under the first one.
 
@@ -38,7 +33,7 @@ def score(
     """
     scores: dict[str, Scores] = {}
     for name, protocol in protocols.items():
-        on_view = None if scores else save_image
+        on_view = None if scores else save
         if name == STABILITY:
             scores[name] = _stability(render, scene, protocol, on_view, calibrates)
         elif protocol.solid_angle and any(view.load_depth and not view.depth_is_relative for view in scene.test):

@@ -3,10 +3,13 @@
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
@@ -16,20 +19,11 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from padgs.baselines import BUILT_IN, METHODS, distribution
-from padgs.checks import ConfigError
+from padgs.checks import ConfigError, lookup
 from padgs.data.perturb import CONDITIONS, NONE
 from padgs.multirun.finished import FOLDER
 from padgs.multirun.overrides import lenient, quoted, root
-from padgs.runs.config import (
-    DEFAULT_METHOD,
-    RunConfig,
-    config_from_values,
-    default_fields,
-    gpus_for,
-    method_choices,
-    method_fields,
-    scene_choices,
-)
+from padgs.runs.config import DEFAULT_METHOD, RunConfig, Settings, config_from_values, method_choices, scene_choices
 from padgs.runs.console import say
 from padgs.runs.run import Method, build_method
 from padgs.runs.store import labels
@@ -38,6 +32,13 @@ from padgs.runs.store import labels
 ConfigStore.__deepcopy__ = lambda store, _: store  # type: ignore[attr-defined]
 # At import, because jobs in processes of their own resolve what was composed elsewhere.
 OmegaConf.register_new_resolver("is_dataset", lambda name, *, _root_: _root_.data.dataset == name, replace=True)
+
+
+def gpus_for(device: str) -> int:
+    """Return how many GPUs a run with this `run.device` asks a cluster for; auto: 1 if this machine has one."""
+    return int(device == "cuda" or (device == "auto" and torch.cuda.is_available()))
+
+
 OmegaConf.register_new_resolver("gpus_for", gpus_for, replace=True)
 OmegaConf.register_new_resolver("gpus_of_slurm", lambda device: None if device == "cpu" else 1, replace=True)
 _registered: list[tuple[Path, dict[str, Any]]] = []  # folder of `conf`, and methods, whose choices Hydra knows
@@ -59,7 +60,9 @@ def multirun(arguments: Sequence[str]) -> DictConfig | None:
     forced = {"-m", "--multirun"} & {*arguments}
     settings = [text for text in lenient(quoted(arguments)) if text not in forced]
     settings += ["hydra.mode=MULTIRUN"] if forced else []
-    settings.append(f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}")
+    settings.append(
+        f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{datetime.now():%Y%m%d-%H%M%S}-{gethostname()}-{os.getpid()}"
+    )
     config = hydra.compose_config("config", settings, RunMode.MULTIRUN, from_shell=False, with_log_configuration=False)
     return config if config.hydra.mode == RunMode.MULTIRUN else None
 
@@ -159,10 +162,10 @@ def register_choices() -> None:
         return
     OmegaConf.register_new_resolver("all_conditions", lambda: ",".join((NONE, *CONDITIONS)), replace=True)
     store = ConfigStore.instance()
-    store.store(name="fields", node=default_fields())
+    store.store(name="fields", node=asdict(Settings()))
     for method in [*METHODS]:
         try:
-            keys = method_fields(method)
+            keys = {"name": method, **asdict(lookup(METHODS, method, "method").Options())}
             has_file = (root() / "conf" / "method" / f"{method}.yaml").exists()
             nodes = [] if has_file else [*method_choices(method)]
         except (Exception, SystemExit) as error:  # of any kind: that package is not ours

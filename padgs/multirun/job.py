@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from padgs.checks import unknown
+from padgs.checks import ConfigError, unknown
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import signature
 from padgs.results import SMALLEST_STATED, Result
@@ -117,11 +117,15 @@ class BoardEntry(Callback):
 
     def __init__(self, board: Board, number: int) -> None:
         self.data: str | None = None  # folder of the data set
-        self._board, self._number, self._state = board, number, JobState(Status.RUNNING)
+        self._before = board.read(number).run  # of a job that Slurm put back into the queue
+        self._board, self._number, self._state = board, number, JobState(Status.RUNNING, self._before)
         self._board.write(number, self._state)
 
     def started(self, folder: Path) -> None:
-        """Write the name of the run folder."""
+        """Write the name of the run folder; a ConfigError if the job began as another run."""
+        if self._before not in ("", folder.name):
+            why = "conf/ or the data have changed meanwhile: restore them, or start the sweep again"
+            raise ConfigError(f"this job began as {self._before}, and would now be {folder.name}; {why}")
         self._state = replace(self._state, run=folder.name, data=self.data)
         self._board.write(self._number, self._state)
 

@@ -174,7 +174,8 @@ class Multirun:
         """Print how the jobs ended; delete the board unless it explains a crash or jobs still need it."""
         for index, state in self.states.items():
             if state.status == Status.ELSEWHERE and (result := self._result(state.run)):  # done by the other process
-                self._end(index, replace(state, status=result.status))
+                self.states[index] = replace(state, status=result.status)  # looked up again: it may lack scores
+                self._rows.append((self._titles[index], state.run))
         self._say(self.line())
         self._show_table()
         counts = self.counts()

@@ -26,6 +26,7 @@ class NativeCamera(ctypes.Structure):
         *fields(Int32, "wrap", "square"),
         *fields(ctypes.c_float, "fx", "fy", "cx", "cy", "widen", "off_panorama"),
         *fields(Int32, "compensate", "cull_ellipsoids"),
+        ("steepness", ctypes.c_float),
     ]
 
 
@@ -51,6 +52,7 @@ class BlendArguments(ctypes.Structure):
     _fields_ = [
         ("grid", TileGrid),
         *fields(Int32, "projection", "wrap", "core_size"),
+        ("steepness", ctypes.c_float),
         ("rays", RayPointers),
         *fields(Pointer, "footprints", "tile_start", "instances", "background"),
         *fields(Pointer, "image", "transmittance", "depth", "last", "pair_counts", "cores", "core_start"),

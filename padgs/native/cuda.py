@@ -67,6 +67,7 @@ class BlendInputs(ctypes.Structure):
     _fields_ = [
         ("table", TileTable),
         *fields(Int32, "projection", "wrap", "core_size"),
+        ("steepness", ctypes.c_float),
         ("rays", abi.RayPointers),
         *fields(Pointer, "footprints", "tile_start", "slots", "reaches", "background"),
         *fields(Pointer, "image", "transmittance", "depth", "last", "core", "tails", "pair_counts"),

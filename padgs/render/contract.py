@@ -1,9 +1,10 @@
 """The contract of all rasterizer backends: input, output, and the definition of the image.
 
 All backends match the definition in values and gradients. Each Gaussian that is not culled acts on a pixel through a
-squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-q / 2)); pairs with alpha < 1/255 are
-skipped. Gaussians are blended front to back by the radial distance of their mean (ties by index), and a pixel stops
-*before* the Gaussian that would bring its transmittance below 1e-4. Where alpha is limited to 0.99 its derivative is 0.
+squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-f(q) / 2)), where f(q) = q unless
+`response` has a steepness; pairs with alpha < 1/255 are skipped. Gaussians are blended front to back by the radial
+distance of their mean (ties by index), and a pixel stops *before* the Gaussian that would bring its transmittance below
+1e-4. Where alpha is limited to 0.99 its derivative is 0.
 Means nearer than 1e-15 or farther than 1e15 world units are culled too: float32 cannot represent their squares.
 This is blending "sorted"; "hybrid" differs in order and stop, see `padgs.render.backends.torch.hybrid_weights`.
 """
@@ -55,6 +56,8 @@ class RenderOptions:
     # n x n samples a pixel, which is their mean; `low_pass` is then in square samples
     supersampling: int = 1
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
+    # s in [0, 1) of `response`, tangent and ray; 0: Gaussians; more: flatter in the middle, with a steeper edge
+    steepness: float = 0.0
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none
     cubemap: bool = False  # render a panorama from the six faces of a cube, each a perspective view
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 standard deviations, as published
@@ -66,11 +69,14 @@ class RenderOptions:
         check_known(self, bounds=("exact", "square"), near_cull=("mean", "ellipsoid"), blending=("sorted", "hybrid"))
         check(self, "a distance >= 0 in world units", lambda near: 0 <= near < math.inf, "near")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "low_pass")
+        check(self, "in [0, 1)", lambda share: 0 <= share < 1, "steepness")
         check(self, f"from 1 to {MAX_SUPERSAMPLING}", _whole(MAX_SUPERSAMPLING), "supersampling")
         check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", _whole(MAX_CORE_SIZE), "core_size")
         check(self, "at least 1", _whole(1 << 62), "max_instances")
         if self.near_cull == "ellipsoid" and self.projection != "ray":
             raise ValueError(f"near_cull=ellipsoid requires projection 'ray', not {self.projection!r}; set mean")
+        if self.steepness and self.projection not in ("tangent", "ray"):
+            raise ValueError(f"steepness requires projection 'tangent' or 'ray', not {self.projection!r}; set 0")
         if self.core_size != CORE_SIZE and self.blending != "hybrid":
             raise ValueError(
                 f"core_size is {self.core_size}, but blending={self.blending} has no core; set blending=hybrid "
@@ -145,6 +151,20 @@ class Removals:
     change: Tensor  # [N] float64 >= 0, mean square change of the image by the same weights
     contribution: Tensor  # [N] float64 in [0, 1], mean of alpha T by the same weights
     peak: Tensor  # [N] in [0, 1], largest alpha T of any pixel
+
+
+def response(q: Tensor, steepness: float) -> Tensor:
+    """Return f(q) = (1 - s) q + s q^2 of squared distances, with the steepness s; alpha = opacity exp(-f(q) / 2).
+
+    1 at one standard deviation, whatever s is. Cf. the generalized exponentials of GES (Hamdi et al. 2024).
+    """
+    return q * (1 - steepness + steepness * q)
+
+
+def largest_q(opacities: Tensor, steepness: float) -> Tensor:
+    """Return the q >= 0 at which Gaussians of these opacities have alpha = `ALPHA_MIN`; 0 for fainter ones."""
+    k, linear = 2 * torch.log((opacities / ALPHA_MIN).clamp(min=1)), 1 - steepness
+    return 2 * k / (linear + torch.sqrt(linear**2 + 4 * steepness * k))
 
 
 Backend = Callable[[Request], Rendering]  # every entry of `padgs.render.BACKENDS`

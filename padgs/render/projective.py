@@ -13,7 +13,7 @@ from torch import Tensor
 from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render import projection
-from padgs.render.contract import ALPHA_MIN, Request
+from padgs.render.contract import ALPHA_MIN, Request, largest_q, response
 from padgs.render.projection import Footprints
 
 PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, for every image size
@@ -27,9 +27,10 @@ class TangentFootprints(Footprints):
     normals: Tensor  # [N, 3] direction of the mean
     whitening: Tensor  # [N, 2, 3] L: q = |L d|^2 / (n.d)^2
     rays: Tensor  # [H, W, 3]
+    steepness: float
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return q = tau^T S^-1 tau with tau = E d / (n.d), on the side of the camera where the mean is."""
+        """Return f(q), q = tau^T S^-1 tau with tau = E d / (n.d), on the side of the camera where the mean is."""
         d = self.rays[rows, columns]  # [P, 3]
         ahead = d @ self.normals[indices].T  # [P, K]
         inside = ahead.detach() > 0
@@ -39,7 +40,7 @@ class TangentFootprints(Footprints):
             first_column, end_column, first_row, end_row = self.boxes[indices].unbind(-1)
             u, v = columns[:, None], rows[:, None]
             inside = inside & (u >= first_column) & (u < end_column) & (v >= first_row) & (v < end_row)
-        return (offsets * offsets).sum(-1), inside
+        return response((offsets * offsets).sum(-1), self.steepness), inside
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,13 @@ class RayFootprints(Footprints):
     whitening: Tensor  # [N, 3, 3] M^-1 with Sigma = M M^T
     rays: Tensor  # [H, W, 3]
     near: float
+    steepness: float
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w, the distance of the maximum."""
+        """Return f(q), q = |o - t w|^2, o = M^-1 mean, w = M^-1 d, and t = o.w / w.w, the distance of the maximum."""
         o, w, t = self._maximum(indices, rows, columns)
         offset = o - t[..., None] * w
-        return (offset * offset).sum(-1), t.detach() > self.near
+        return response((offset * offset).sum(-1), self.steepness), t.detach() > self.near
 
     def distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """Return t, the distance of the maximum along the ray."""
@@ -63,10 +65,12 @@ class RayFootprints(Footprints):
             return self._maximum(indices, rows, columns)[2]
 
     def slope(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Return 2 |M^-T (o - t w)|; the derivative through t vanishes at the maximum."""
+        """Return 2 f'(q) |M^-T (o - t w)|; the derivative through t vanishes at the maximum."""
         with torch.no_grad():
             o, w, t = self._maximum(indices, rows, columns)
-            return 2 * torch.einsum("kic,pki->pkc", self.whitening[indices], o - t[..., None] * w).norm(dim=-1)
+            q = (o - t[..., None] * w).square().sum(-1)
+            slope = torch.einsum("kic,pki->pkc", self.whitening[indices], o - t[..., None] * w).norm(dim=-1)
+            return 2 * (1 - self.steepness + 2 * self.steepness * q) * slope
 
     def _maximum(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return o [K, 3], w [P, K, 3] and t [P, K]."""
@@ -100,13 +104,13 @@ def project_tangent(request: Request) -> TangentFootprints:
     if options.bounds == "square" and isinstance(camera, Panorama):
         boxes = tangent_boxes(means.detach(), spread.detach(), determinant.detach(), low_pass, camera)
         visible &= projection.is_on_image(boxes, camera.width, camera.height)
-    return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, rays)
+    return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, rays, options.steepness)
 
 
 def project_ray(request: Request) -> RayFootprints:
     """Project to rays: M^-1 = diag(1 / scale) R^T. Cull Gaussians that contain the camera: |M^-1 mean|^2 <= k.
 
-    k = 2 ln(255 opacity) bounds the drawn ellipsoid. With near_cull=ellipsoid, also cull where that ellipsoid reaches
+    k = `largest_q` bounds the drawn ellipsoid. With near_cull=ellipsoid, also cull where that ellipsoid reaches
     the plane n.x = near, n the direction of the mean: r - sqrt(k n^T Sigma n) <= near (SPaGS).
     """
     camera, options = request.camera, request.options
@@ -119,14 +123,14 @@ def project_ray(request: Request) -> RayFootprints:
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
     drawn = (opacities.detach() >= ALPHA_MIN) & torch.isfinite(gaussians.scales.detach()).all(-1)
-    largest = 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
+    largest = largest_q(opacities.detach(), options.steepness)
     outside = distance > largest
     if options.near_cull == "ellipsoid":
         along = ((orientations * gaussians.scales[:, None, :]).mT @ (means / radius[:, None])[..., None]).detach()
         outside &= radius.detach() - torch.sqrt(largest * (along[..., 0] ** 2).sum(-1)) > options.near
     visible = in_front & drawn & outside & torch.isfinite(distance)  # else float overflows or nothing spreads
     rays = camera.rays(dtype=means.dtype, device=means.device)
-    return RayFootprints(opacities, radius, visible, None, means, whitening, rays, options.near)
+    return RayFootprints(opacities, radius, visible, None, means, whitening, rays, options.near, options.steepness)
 
 
 def mean_shift(means: Tensor, mean_offsets: Tensor) -> Tensor:

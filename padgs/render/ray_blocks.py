@@ -14,7 +14,7 @@ from torch import Tensor
 
 from padgs.geometry.camera import Camera, RayTable
 from padgs.render.backends.native import off_panorama
-from padgs.render.contract import ALPHA_MIN, Backend, Removals, Rendering, Request
+from padgs.render.contract import Backend, Removals, Rendering, Request, largest_q
 from padgs.render.cubemap import summed_counters
 from padgs.render.projection import camera_frame
 from padgs.render.projective import mean_shift
@@ -72,7 +72,7 @@ def seen(request: Request) -> Tensor:
 def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice], Tensor]]:
     """Yield blocks of the image, row by row, with their pixels and the indices of the Gaussians that reach them.
 
-    A Gaussian is drawn within k standard deviations, k^2 = 2 ln(opacity / ALPHA_MIN), along its longest axis with the
+    A Gaussian is drawn within k standard deviations, k^2 = `largest_q`, along its longest axis with the
     low-pass filter; seen from the camera that is an angle of at most asin(k sigma / r).
     """
     gaussians, options, camera = request.gaussians, request.options, request.camera
@@ -81,7 +81,7 @@ def _in_sight(request: Request) -> Iterator[tuple[RayTable, tuple[slice, slice],
         means = means + mean_shift(means, request.mean_offsets)
     radius = means.norm(dim=-1).clamp(min=1e-30)
     spread = (gaussians.scales.amax(-1) / radius).square() + options.low_pass / camera.focal**2
-    largest = 2 * torch.log((gaussians.opacities / ALPHA_MIN).clamp(min=1))
+    largest = largest_q(gaussians.opacities, options.steepness)
     reach = torch.asin((largest * spread).sqrt().clamp(max=1)) + SLACK
     everywhere = largest * spread >= 1
     directions = means / radius[:, None]

@@ -28,6 +28,9 @@ DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")
 
 
+DEVICES = ("auto", "cpu", "cuda")
+
+
 @dataclass(frozen=True)
 class DataConfig(DataSettings):
     """The `data` group: the source of the scene."""
@@ -104,7 +107,7 @@ class RunOptions:
     pictures: bool = True  # save ground truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        check_known(self, device=("auto", "cpu", "cuda"))
+        check_known(self, device=DEVICES)
         check(self, "not empty (is a variable of the shell unset?)", bool, "folder")
         counts = ("jobs", "threads", "log_every", "probe_every", "checkpoint_every")
         check(self, "at least 1", lambda count: count is None or count >= 1, *counts)
@@ -188,7 +191,7 @@ class RunConfig(Settings):
 
 def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
     """Return the typed configuration of values that Hydra composed; a ConfigError names the key and the known ones."""
-    known = (*default_fields(), "method", "protocol")
+    known = (*asdict(Settings()), "method", "protocol")
     for key in values:
         if key not in known:
             inner = [f"{group}.{key}" for group, keys in values.items() if isinstance(keys, Mapping) and key in keys]
@@ -230,16 +233,6 @@ def _protocol(name: str, rules: Mapping[str, Any]) -> Protocol:
     return typed(Protocol, {**vars(PROTOCOLS[name]), **rules, "name": name}, f"protocol.{name}")
 
 
-def default_fields() -> dict[str, Any]:
-    """Return all keys of the configuration with their defaults, except those of method and protocol."""
-    return asdict(Settings())
-
-
-def method_fields(name: str) -> dict[str, Any]:
-    """Return the keys of `method` with their defaults for one method."""
-    return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
-
-
 def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield group and node for Hydra of `method=NAME`, and of its own render and train settings, if it has any.
 
@@ -271,11 +264,6 @@ def scene_choices() -> dict[str, dict[str, Any]]:
         for scene in known.scenes
     }
     return {name: {"defaults": [{"override /data": data}], "data": keys} for name, (data, keys) in values.items()}
-
-
-def gpus_for(device: str) -> int:
-    """Return how many GPUs a run with this `run.device` asks a cluster for; auto: 1 if this machine has one."""
-    return int(device == "cuda" or (device == "auto" and torch.cuda.is_available()))
 
 
 def choose_device(name: str, render: RenderConfig, *, strict: bool = False) -> torch.device:

@@ -98,11 +98,13 @@ class LiveLine(Display):
         super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES, transient=transient)
         self._times: deque[tuple[int, float, float]] = deque(maxlen=RECENT)
         self._psnr: float | None = None
+        self._loss: float | None = None
 
     def update(self, record: Record, psnr: float | None) -> None:
         """Show a record and the last measured PSNR of the held-out view."""
         self._times.append((record.iteration, record.progress, time.monotonic()))
         self._psnr = self._psnr if psnr is None else psnr
+        self._loss = record.loss if isinstance(record.loss, float) else self._loss  # others wait for a GPU, untimed
         if self.is_due or len(self._times) == 1 or record.progress == 1:
             self.show(self._line(record))
 
@@ -111,7 +113,7 @@ class LiveLine(Display):
         left = duration((1 - share) / (share - behind) * (end - start)) if share > behind else MISSING
         filled = round(BAR * share)
         parts = [f"ETA {left}", f"{'█' * filled}{'░' * (BAR - filled)} {share:4.0%}", f"{record.iteration}"]
-        parts.append(f"loss {float(record.loss):.4f}")
+        parts += [] if self._loss is None else [f"loss {self._loss:.4f}"]
         if self._psnr is not None:
             parts.append(f"{self._psnr:.2f} dB")
         parts += [f"{compact(count)} {name}" for name, count in [*record.counts.items()][:1]]

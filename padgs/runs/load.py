@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Container, Iterable
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from padgs import results
-from padgs.checks import ConfigError
+from padgs.checks import ConfigError, unknown
 from padgs.data.camera_paths import along_cameras
 from padgs.data.capture import DataError
 from padgs.evaluation.protocols import PROTOCOLS
@@ -26,7 +27,7 @@ from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.methods.splats.model import SplatModel
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
-from padgs.runs.config import RunConfig, choose_device, config_from_values
+from padgs.runs.config import DEVICES, RunConfig, choose_device, config_from_values
 from padgs.runs.run import build_method, load_scene
 from padgs.runs.store import PROGRESS, Progress, RunFolderError, RunStore, config_hash
 from padgs.scene import Scene, View
@@ -161,6 +162,8 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     backend is not for it is rendered by that of the device. A RunFolderError says that it is no run folder;
     CheckpointError, ResultError and ConfigError name a file that is damaged or of another version.
     """
+    if device not in DEVICES:
+        raise ValueError(unknown("device", device, DEVICES))
     path = Path(folder)
     store = RunStore(path.resolve() if path.name in ("", "..") else path)  # names of files are made of the last part
     settings = store.path / results.CONFIG_NAME
@@ -174,11 +177,11 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     try:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
         run = {"configuration": config_hash(values)}  # the data are not read
-        source, above = values["data"], (Path(), *store.path.absolute().parents)  # training began in one of these
-        source["path"] = _found(source["path"], above, ("",)) if data_path is None else str(data_path)
-        source |= {
-            key: _found(source[key], (Path(source["path"] or ""), *above)) for key in ("points", "mask", "images")
-        }
+        source, up = values["data"], (Path(), *store.path.absolute().parents)  # training began in one of these
+        source["path"] = _found(source["path"], up, ("",)) if data_path is None else str(data_path)
+        source |= {key: _found(source[key], (Path(source["path"] or ""), *up)) for key in ("points", "mask", "images")}
+        if source.get("disk_cache") not in (None, "auto", "off") and not os.path.isdir(source["disk_cache"]):
+            source["disk_cache"] = "auto"  # that folder was on the machine that trained
         values["run"]["device"] = device
         if values["render"]["backend"] in missing_backends(device):
             values["render"]["backend"] = "auto"
@@ -195,7 +198,9 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
     with checkpoint.understood(store.checkpoint):
         method.load_state(state)
         iteration = Progress(**state.values[PROGRESS]).iteration
-    return LoadedRun(store.path, config, method, store.result(), iteration, digest)
+    result = store.result()
+    notes = () if result else (f"the run has not ended; its model is that of iteration {iteration}",)
+    return LoadedRun(store.path, config, method, result, iteration, digest, notes=notes)
 
 
 def _found(path: str | None, folders: Iterable[Path], keywords: Container[str] = KEYWORDS) -> str | None:
@@ -203,7 +208,8 @@ def _found(path: str | None, folders: Iterable[Path], keywords: Container[str] =
     prefix, colon, name = (path or "").rpartition("inverted:")
     if prefix or name in keywords:
         return path
-    return next((f"{colon}{folder / name}" for folder in folders if (folder / name).exists()), path)
+    there = (str(folder / name) for folder in folders)
+    return next((f"{colon}{place}" for place in there if os.path.exists(place)), path)  # or behind a closed folder
 
 
 def missing_backends(device: str) -> set[str]:

@@ -5,6 +5,7 @@ A run that was interrupted resumes from its checkpoint; a finished run is shown 
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import time
@@ -90,11 +91,14 @@ def run(
         show_result(result, store.path, words)
         return result
     with store:
+        earlier = store.result()
         result = _completed(config, scene, store, words)
         if result is None:
             method, progress = _prepared(config, scene, store, words)
             saved_at, saved, interrupted, before = time.monotonic(), progress, False, progress
             begun, made_by = _joined(initial_result(config, scene, store.path.name), before)
+            if earlier is not None:  # a failed run that starts again
+                begun = replace(begun, experiments=results.joined(earlier.experiments, begun.experiments))
             with _Outcome(begun, scene, before) as outcome:
                 with (
                     Interrupt(callback.stop_requested) as interrupt,
@@ -161,6 +165,7 @@ def start(config: RunConfig) -> torch.device:
         torch.set_num_threads(config.run.threads_per_job)
     torch.manual_seed(config.seed)
     device = choose_device(config.run.device, config.render, strict="SLURM_JOB_GPUS" in os.environ)
+    gc.collect()  # models of earlier runs in this process, which refer to themselves
     clock.reset_peak_memory(device)
     return device
 
@@ -343,9 +348,7 @@ def _refuse_other_rules(store: RunStore, result: Result, unscored: Mapping[str, 
     for name, asked in ((name, _stored(rules)) for name, rules in unscored.items() if name in result.scores):
         rules = result.scores[name].protocol
         if not _covers(asked, rules):
-            others = ", ".join(
-                f"{key}={rules.get(key)}, not {asked[key]}" for key in asked if rules.get(key) != asked[key]
-            )
+            others = ", ".join(f"{key}={rules.get(key)}, not {of}" for key, of in asked.items() if rules.get(key) != of)
             raise RunFolderError(
                 f"{store.path} has scores of {name} under other rules ({others}), and a run has scores of one; "
                 "set run.folder to another folder"

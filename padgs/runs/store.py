@@ -158,7 +158,8 @@ class RunStore:
     def log(self, record: Record, probed: Mapping[str, float]) -> None:
         """Append a line to log.jsonl; `probed` holds the metrics of the held-out view, empty if not measured."""
         line: dict[str, Any] = {"iteration": record.iteration, "progress": round(record.progress, 6)}
-        line |= {"loss": float(record.loss), "seconds": round(record.seconds, 4), **record.counts, **probed}
+        line |= {"seconds": round(record.seconds, 4), **record.counts, **probed}
+        line |= {"loss": record.loss} if isinstance(record.loss, float) else {}  # others wait for a GPU, untimed
         if record.events:
             line["events"] = list(record.events)
         with self._writing(), self._log.open("a") as file:

@@ -193,9 +193,7 @@ class Corrections(nn.Module):
             first, axis = scene.train[0], options.lens.removeprefix(FISHEYES)
             is_map = options.lens == MAP
             if is_map and options.depth_weight:
-                raise ValueError(
-                    "train.lens=map resamples photographs, and not their depth maps; set train.depth_weight=0"
-                )
+                raise ValueError("train.lens=map resamples photographs, and not their depth maps; set depth_weight=0")
             self.lens = CameraMap(first.width, first.height) if is_map else DualLens(axis, scene_scale=scene.scale)
 
     def groups(self, iterations: int) -> list[ParameterGroup]:

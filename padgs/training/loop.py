@@ -76,7 +76,7 @@ class Trainer:
         self._optimizer = Optimizer(groups, options.check_every, betas=(0.9, options.adam_beta2), eps=self.ADAM_EPS)
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out = self._early_stopping.held_out
-        self._unit, depth = scene.scale, options.depth_kind if options.depth_weight > 0 else None
+        self._unit, depth = scene.scale, options.depth_kind if options.depth_weight > 0 else ""
         self._views = TrainingViews(scene, options.weight, self._device, coarse_share, seed, held_out, depth=depth)
         self._order: Any = self._views  # its state decides which data the next iterations see
         pixels = sum(view.width * view.height for view in scene.train)

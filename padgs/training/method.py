@@ -101,9 +101,7 @@ class Method(ABC):
         self._trainer.began = self._trainer.spent
         if self._warm_start_state is not None:
             stored, own = self._warm_start_state.under(VIEWS), self._trainer.corrections.state_dict()
-            other = {
-                name.partition(".")[0] for name in stored if stored[name].shape != own.get(name, stored[name]).shape
-            }
+            other = {name.partition(".")[0] for name, of in stored.items() if of.shape != own.get(name, of).shape}
             whole = {name: of for name, of in stored.items() if name in own and name.partition(".")[0] not in other}
             self._trainer.corrections.load_state_dict(whole, strict=False)
         if self._loaded_state is not None:

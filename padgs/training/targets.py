@@ -69,13 +69,7 @@ class Targets:
     """
 
     def __init__(
-        self,
-        views: Sequence[View],
-        weight: str,
-        device: Device = "cpu",
-        coarse_share: float = 0.0,
-        *,
-        depth: str | None = None,
+        self, views: Sequence[View], weight: str, device: Device = "cpu", coarse_share: float = 0.0, *, depth: str = ""
     ) -> None:
         """Load nothing yet; `weight` is a name of ROW_WEIGHTS, `depth` one of DEPTH_KINDS if depth maps are used."""
         if depth and not any(view.load_depth for view in views):
@@ -192,7 +186,7 @@ class TrainingViews:
         seed: int = 0,
         held_out: Collection[int] = (),
         *,
-        depth: str | None = None,
+        depth: str = "",
     ) -> None:
         """Shuffle the views, except those `held_out` until `include_held_out`; other arguments as in `Targets`."""
         self._scene, self._held_out = scene, tuple(held_out)

@@ -46,7 +46,6 @@ class TradeOff:
     points: tuple[Point, ...]
     runs: DataFrame
     notes: tuple[str, ...]
-    equal_images: bool = True  # whether methods are compared after as many images; else after equal time
 
     def role(self, preset: str) -> str:
         """Return "release" for a released program with its deviations, "main" for the preset that stands for its method
@@ -109,13 +108,13 @@ def equal_times(run_set: RunSet) -> list[TradeOff]:
     groups: dict[tuple[str, ...], dict[Place, DataFrame]] = {}
     for name, title, own in sheets(runs.loc[runs["variant"] == ""], shown, "equal_time", OF_A_CHART):
         place, *kind = own.iloc[0][["place", "resolution", "length"]]
-        made = _trade_off("equal_time", {place: own}, shown, equal_images=False)
+        made = _trade_off("equal_time", {place: own}, shown)
         if len({point.preset for point in made.points}) >= FEWEST:
             found.append(replace(made, name=name, title=title))
             groups.setdefault((place.seen, *kind), {})[place] = without_data(own)
     means = []
     for (seen, size, length), group in groups.items():
-        made = _trade_off("equal_time", group, shown, equal_images=False)
+        made = _trade_off("equal_time", group, shown)
         if len(group) > 1 and not made.points:
             run_set.warnings.append(f"{size}, {length}: no scene was finished in all settings, so there is no mean")
         elif len(group) > 1:
@@ -142,7 +141,7 @@ def _is_release(preset: str) -> bool:
     return methods.published_as(preset) != preset
 
 
-def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, equal_images: bool = True) -> TradeOff:
+def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
     measures = (*(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/")), *COSTS)
     every = settings(pd.concat(group.values()))
     for setting in every:
@@ -163,7 +162,7 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request, eq
         what = f"{what}, mean over its scenes {named}" if what else f"mean over {named}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol) + failure_notes(every)
-    return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes), equal_images)
+    return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes))
 
 
 def _protocol(runs: DataFrame) -> str:

@@ -84,7 +84,7 @@ def draw(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> tuple[Any, list[tup
     made, axes = drawing.figure(len(shown), 1, *SIZE)
     marks = [_marks(trade_off, cost) for cost, _, _ in shown]
     presets = [point.preset for point in trade_off.points]
-    apart = unranked(trade_off.runs, equal_images=trade_off.equal_images)
+    apart = unranked(trade_off.runs)
     for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
         panel.set_xlabel(f"{words}, {unit} ↓")
         panel.set_ylabel(f"{quality.column.title}, dB ↑")

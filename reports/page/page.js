@@ -79,6 +79,9 @@ if (data.scenes.length) {
     const [first] = viewers;
     const direction = first ? { yaw: first.getYaw(), pitch: first.getPitch(), hfov: first.getHfov() } : { hfov: 100 };
     viewers.forEach((viewer) => viewer.destroy());
+    viewers = [];
+    document.getElementById("viewer").hidden = !view().panorama;
+    if (!view().panorama) return;
     panels[1].querySelector("figcaption").textContent = method().title;
     viewers = [["panorama-truth", view().truth], ["panorama-render", method().render]].map(([id, number]) =>
       pannellum.viewer(id, {

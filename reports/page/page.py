@@ -125,7 +125,7 @@ def _view(made: Album, shown: Sequence[Setting], name: str, warnings: list[str])
             warnings.append(f"a picture is left out: {error}")
             continue
         if view["truth"] is None:
-            view["truth"] = made.add(truth)
+            view["truth"], view["panorama"] = made.add(truth), truth.width == 2 * truth.height
         images = {"render": made.add(render), "error": made.add(error, IMAGE_WIDTH // 2)}
         psnr = run["view_psnr"].get(name)
         metric = "" if psnr is None else f", PSNR {psnr:.2f} dB"
@@ -150,7 +150,7 @@ def _scene_sets(runs: DataFrame) -> dict[str, list[str]]:
     sets: dict[str, list[str]] = {}
     for place in by_place(runs):
         for title in filter(None, (place.seen, TITLES.get(place.dataset, place.dataset))):
-            sets.setdefault(title, []).append(place.scene)
+            sets.setdefault(title, [title] if title in TITLES.values() else []).append(place.scene)
     return sets | {place.heading: [place.scene] for place in by_place(runs)}
 
 

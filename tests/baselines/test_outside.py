@@ -33,7 +33,7 @@ def installed(root, tmp_path, monkeypatch):
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: my-method\nVersion: 0.1\n")
     (information / "entry_points.txt").write_text("\n".join(lines).replace('"', ""))
-    for path in (folder, tmp_path):
+    for path in (folder, folder / "tests", tmp_path):
         monkeypatch.syspath_prepend(path)
     for name, value in outside().items():
         monkeypatch.setitem(METHODS, name, value)

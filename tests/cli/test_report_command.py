@@ -1,3 +1,5 @@
+import csv
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -166,6 +168,30 @@ def test_a_refused_report_does_not_stop_the_others(tmp_path):
     assert (tmp_path / "out" / "table1.md").exists() and not (tmp_path / "out" / "table4.md").exists()
 
 
+def test_no_old_table_lies_beside_new_ones(tmp_path):
+    first, *others = compared(["synthetic-outdoor"], seeds=1)
+    write([replace(first, machine={"gpu": "H200"}), *others], tmp_path / "runs")
+    (tmp_path / "out").mkdir()
+    mine = {f"{name}.{ending}" for name in ("gallery", "chart", "sweep") for ending in ("md", "tex", "csv")}
+    old = {f"{name}.{ending}" for name in ("table1", "table4", "order") for ending in ("md", "tex", "csv")}
+    for name in mine | old:
+        (tmp_path / "out" / name).write_text("old")
+    done = report("all", tmp_path / "runs", "--out", tmp_path / "out", "--strict")
+    assert done.exit_code == 1 and "error: table4: " in done.output and "error: table1: " not in done.output
+    written = {path.name: path.read_bytes() != b"old" for path in (tmp_path / "out").iterdir()}
+    assert not {name for name in written if name.startswith(("table1.", "table4."))}, "empty, and refused"
+    assert all(written[f"table2.{ending}"] for ending in ("md", "tex", "csv"))
+    assert {name for name, is_new in written.items() if not is_new} == mine, "no report has tables of these names"
+
+
+def test_a_file_in_the_place_of_the_folder_is_named_whatever_comes_first(tmp_path):
+    write(compared(["synthetic-outdoor"], seeds=1), tmp_path / "runs")
+    (tmp_path / "out").write_text("mine")
+    done = report("all", tmp_path / "runs", "--out", tmp_path / "out")
+    said = "".join((done.output + done.stderr).split())
+    assert done.exit_code == 1 and "nameanotherplacewith--out" in said and (tmp_path / "out").read_text() == "mine"
+
+
 def test_trials_of_different_kinds_have_their_own_blocks_and_rows(tmp_path):
     first, *others = compared(["synthetic-room"], seeds=1)
     longer = small(24.0, method="omnigs", iterations=7, experiments=("all_methods@cpu",))
@@ -181,6 +207,24 @@ def test_runs_without_an_experiment_are_a_sweep_where_they_differ_in_a_key(tmp_p
     write([replace(one, experiments=()) for one in swept(scenes=["synthetic-room"], seeds=1)], tmp_path / "runs")
     assert report("sweep", tmp_path / "runs", "--metric", "psnr").exit_code == 0
     assert "tau" in (tmp_path / "runs" / "reports" / "sweep_ad_hoc.csv").read_text()
+
+
+def test_the_sweep_of_the_quickstart_is_drawn(root, tmp_path):
+    write(swept(), tmp_path / "runs")
+    lines = (root / "docs" / "quickstart.md").read_text("utf-8").splitlines()
+    (command,) = (shlex.split(line) for line in lines if line.startswith("padgs report sweep "))
+    assert command[3] == "runs" and command[-4:] == ["--metric", "ws_psnr", "--metric", "gaussians"]
+    done = report("sweep", tmp_path / "runs", *command[4:], "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"sweep_tau_cpu.png", "sweep_tau_cpu.csv"}
+    points = list(csv.DictReader((tmp_path / "out" / "sweep_tau_cpu.csv").read_text("utf-8").splitlines()))
+    room = {
+        (float(of["x"]), of["quantity"]): (float(of["mean"]), of["n"])
+        for of in points
+        if of["scene"] == "synthetic-room"
+    }
+    assert {quantity for _, quantity in room} == {"WS-PSNR", "Gaussians"} and len(room) == 2 * 4
+    assert room[0.9, "WS-PSNR"] == (pytest.approx(25 + 0.1 - 0.4), "3") and room[0.9, "Gaussians"] == (95_000, "3")
 
 
 def test_an_experiment_is_known_without_its_scale_and_where_says_what_there_is(tmp_path):

@@ -211,6 +211,35 @@ def test_the_convert_command(world: World, tmp_path: Path) -> None:
     )
 
 
+def test_the_camera_path_has_the_natural_order_of_names(world: World, tmp_path: Path) -> None:
+    write_colmap_text(replace(world, names=("1", "2", "10", "11", "12", "100"), test=("2",)), tmp_path)
+    steps = np.linalg.norm(np.diff(world.centers, axis=0), axis=1)
+    assert check(tmp_path).path_length == pytest.approx(steps.sum())
+
+
+def test_cameras_at_one_centre_are_a_problem_wherever_it_is(world: World, tmp_path: Path) -> None:
+    write_colmap_text(replace(world, centers=np.tile([0.7, -0.3, 0.9], (6, 1))), tmp_path / "one")
+    same = "all cameras have the same centre; depth cannot be learned"
+    assert same in check(tmp_path / "one").problems
+    write_colmap_text(world, tmp_path / "two")
+    for side, name in (("train", "pano_00"), ("test", "pano_01")):
+        (tmp_path / "two" / f"{side}.txt").write_text(name)
+    report = check(tmp_path / "two")
+    assert report.problems == [] and (report.train, report.test) == (1, 1), "the other one stands elsewhere"
+
+
+def test_a_part_of_a_panorama_needs_no_mask(narrow: Path) -> None:
+    report = check(narrow)
+    assert report.problems == [] and report.suggestion is None
+    assert [*report.masked.values()] == pytest.approx(6 * [8 / 9])
+    assert report.colour_correlation is not None and report.colour_correlation > 0.95
+    mask = np.zeros((48, 96), np.uint8)
+    mask[16:19, 32:64] = 255  # 3 of the 16 rows that the pictures show
+    _save(narrow, "mask.png", mask)
+    notes = check(narrow, options=DataOptions(mask="mask.png")).notes
+    assert any("the masks of 6 views hide more than 75% of the image: pano_00 (81.2%)" in note for note in notes), notes
+
+
 def _shuffle_colours(folder: Path) -> None:
     """Give the points the colours of other points."""
     file = folder / "sparse/0/points3D.txt"

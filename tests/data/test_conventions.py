@@ -65,6 +65,25 @@ def test_colours_identify_the_convention(case: str, world: World) -> None:
     assert case == "none" or fits[0] < max(fits) - 0.2
 
 
+@pytest.mark.parametrize(("case", "part"), [("none", 3), ("OpenGL", 3), ("turned cloud", 6)])
+def test_colours_of_narrow_pictures_identify_the_convention(case: str, part: int, world: World) -> None:
+    misread, words = MISREADINGS[case]
+    images = torch.stack([torch.from_numpy(image) for image in world.images])
+    shown = torch.zeros(32, 64, 1, dtype=torch.uint8)
+    poses = misread(_poses(world))
+    shown[16 - 16 // part : 16 + 16 // part, 32 - 32 // part : 32 + 32 // part] = 1
+    points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
+    fits = [colour_fit(known.convert(poses), images * shown, points, colors) for known in known_conventions()]
+    _check_words(words, fits)
+    assert max(fits) > 0.95
+    assert case == "none" or fits[0] < max(fits) - 0.2
+
+
+def test_colours_of_black_pictures_are_unrelated(world: World) -> None:
+    points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
+    assert colour_fit(_poses(world), torch.zeros(6, 32, 64, 3, dtype=torch.uint8), points, colors) == 0.0
+
+
 @pytest.mark.parametrize("case", MISREADINGS)
 def test_observations_identify_the_convention(case: str, world: World) -> None:
     misread, words = MISREADINGS[case]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from support.fixtures import HALF, World, write_cloud, write_colmap_text
 
 from padgs.checks import lookup
-from padgs.data import DATASETS, DataError, load
+from padgs.data import DATASETS, DataError, DataOptions, load
 from padgs.data.capture import Capture, DepthMeaning, Frame
 from padgs.data.check import check
 from padgs.data.depths import Depth, _depth_files, _exr
@@ -93,6 +93,10 @@ def test_ob3d(depths: bool, world: World, tmp_path: Path):
     (folder / "Train.txt").write_text("0\nimages/00002_rgb.png\n00003_rgb\n")
     (folder / "cameras" / "._00000_cam.json").write_bytes(b"\0\5\x16\7")  # of macOS
     assert [view.name for view in load(folder).train] == ["00000_rgb", "00002_rgb", "00003_rgb"]
+    (folder / "sparse" / "sparse.ply").write_bytes(b"damaged")
+    with pytest.raises(DataError, match="sparse.ply is no PLY file"):
+        load(folder)
+    assert len(load(folder, points="random").points) == 100_000
 
 
 def test_tartanair(world: World, tmp_path: Path):
@@ -245,6 +249,8 @@ def test_depths_are_checked_against_the_points_and_converted(world: World, tmp_p
     before, after = load(tmp_path / "a").train[0], load(tmp_path / "b").train[0]
     torch.testing.assert_close(after.load_depth(), before.load_depth())
     statement.write_text('{"measure": "ray"}')
+    random = check(tmp_path / "a", options=DataOptions(points="random"))
+    assert random.problems == [] and not any("depth maps agree" in note for note in random.notes)
     (problem,) = check(tmp_path / "a").problems
     assert "agree with 0% of the points to 10%, and are about 1e+03 times as far" in problem
 

@@ -1,6 +1,7 @@
 """Worlds in metres, against cameras, points and GPS of known scale."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from padgs.cli.commands import app
 from padgs.data import DataError
 from padgs.data.camera_paths import centers
 from padgs.data.capture import Cloud, Frame
-from padgs.data.metres import KnownLength, gps_of, local_metres, moved, to_metres, unit_note
+from padgs.data.metres import KnownLength, gps_of, local_metres, moved, named, to_metres, unit_note
 from padgs.data.synthetic.paths import cam_from_world
 
 SCALE = 0.37  # world units per metre
@@ -62,6 +63,20 @@ def test_two_cameras_at_a_known_distance():
     frames = cameras()
     metres = math.hypot(20, 4 * math.sin(5), 0.02 * math.sin(10))
     assert scale_of(frames, KnownLength(("00.png", "10", metres)), room()) == pytest.approx(1 / SCALE)
+
+
+def test_names_are_found_in_any_case_and_unicode_form():
+    assert named(["Ku\u0308che.JPG", "b\u00e4d/1.png", "2.png"], "k\u00fcche.jpg", "K\u00dcCHE", "Ba\u0308d/1") == [
+        0,
+        0,
+        1,
+    ]
+    frames = [replace(frame, name=f"Fl\u00fcr {frame.name}") for frame in cameras()]
+    metres = math.hypot(20, 4 * math.sin(5), 0.02 * math.sin(10))
+    known = KnownLength(("flu\u0308r 00.JPG", "FL\u00dcR 10", metres))
+    assert scale_of(frames, known, room()) == pytest.approx(1 / SCALE)
+    with pytest.raises(DataError, match="no panorama with a pose is called 'flur 00'; known: Flür 00.jpg"):
+        named([frame.name for frame in frames], "flur 00")
 
 
 def test_cameras_at_a_known_height_above_the_floor():

@@ -5,8 +5,9 @@ from collections import Counter
 import pytest
 from rich.console import Console
 
+from padgs.checks import ConfigError
 from padgs.multirun import sweep
-from padgs.multirun.job import Board, JobState
+from padgs.multirun.job import Board, BoardEntry, JobState
 from padgs.multirun.sweep import Display, repeated, status_line
 
 
@@ -70,3 +71,25 @@ def test_a_stop_is_heard_by_its_own_process_even_on_a_full_disk(tmp_path):
     board = Board(tmp_path / "taken" / "board")
     board.request_stop()
     assert board.stop_requested()
+
+
+def requeued(folder, run: str | None) -> JobState:
+    """Begin a job as Slurm does after each preemption, and return what is on the board; None: it loads its data yet."""
+    entry = BoardEntry(Board(folder / "board"), 3)
+    if run is not None:
+        entry.started(folder / run)
+    return Board(folder / "board").read(3)
+
+
+def test_a_requeued_job_goes_on_with_its_run(tmp_path):
+    assert requeued(tmp_path, "room_1") == requeued(tmp_path, "room_1") == JobState("running", "room_1")
+
+
+@pytest.mark.parametrize("preempted_again", [False, True])
+def test_a_requeued_job_that_would_be_another_run_is_refused(tmp_path, preempted_again):
+    requeued(tmp_path, "room_1")
+    if preempted_again:
+        requeued(tmp_path, None)
+    with pytest.raises(ConfigError, match=r"began as room_1, and would now be room_2; conf/ or the data have changed"):
+        requeued(tmp_path, "room_2")
+    assert Board(tmp_path / "board").read(3).run == "room_1"

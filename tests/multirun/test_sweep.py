@@ -287,6 +287,24 @@ def test_a_job_of_another_process_counts_as_neither_failed_nor_done(tmp_path, ca
     assert "2 of 3 done, 1 elsewhere" in start.out.getvalue()
 
 
+class FinishedElsewhere(Scored):
+    def end(self, number, job):
+        self.finish(number, job, "ok")
+        if job == "++seed=2":
+            self.board.write(number, JobState("elsewhere", "room_2", "worked on by another process"))
+
+
+@pytest.mark.parametrize("target", [IN_PROCESS, ELSEWHERE])
+def test_a_run_that_another_process_finished_counts_and_is_looked_up_again(tmp_path, target):
+    """It may lack the experiment of this multirun, and scores under its protocols."""
+    start = FinishedElsewhere(tmp_path, 1, target)
+    assert start.counts() == {"ok": 3}
+    assert "3 of 3 done\n" in start.out.getvalue() and "seed = 2  " in start.out.getvalue().split("3 of 3 done\n")[-1]
+    again = Scored(tmp_path, 2, target)
+    assert again.counts() == {"ok": 3} and again.launched == ["++seed=2"]
+    assert Scored(tmp_path, 3, target).multirun.jobs == [], "now all are known"
+
+
 class Interrupts(Start):
     """Somebody presses Ctrl-C while the second job runs; it sees the board and stops, and the third does not start."""
 

@@ -2,7 +2,10 @@
 
 import os
 import random
+import re
 import signal
+import socket
+import subprocess
 import time
 from pathlib import Path
 from unittest.mock import Mock
@@ -12,6 +15,7 @@ from omegaconf import OmegaConf
 from support.tiny_run import SMALLEST, finish
 
 from padgs.checks import ConfigError
+from padgs.multirun.composition import composing, multirun
 from padgs.multirun.overrides import root
 from padgs.multirun.sweep import sweep
 from padgs.reports import store
@@ -50,6 +54,23 @@ def test_runs_of_ray_ask_for_the_gpu_that_they_use(monkeypatch, device, here, as
 def test_jobs_of_slurm_ask_for_a_gpu_unless_they_use_none(device, asked):
     slurm = OmegaConf.load(root() / "conf" / "launcher" / "slurm.yaml")
     assert OmegaConf.merge(slurm, {"run": {"device": device}}).hydra.launcher.gpus_per_node == asked
+
+
+@pytest.mark.parametrize(("allotted", "told"), [({"SLURM_CPUS_PER_TASK": "8"}, "8"), ({}, "unset")])
+def test_steps_of_a_slurm_job_have_all_cores_of_the_job(allotted, told):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    with composing():
+        setup = multirun(["-m", "launcher=slurm", "seed=0,1"]).hydra.launcher.setup
+    script = "\n".join(["set -e", *setup, "sh -c 'echo ${SRUN_CPUS_PER_TASK-unset}'"])
+    done = subprocess.run(["bash", "-c", script], env={"PATH": os.environ["PATH"]} | allotted, capture_output=True)
+    assert (done.returncode, done.stdout.decode().split()) == (0, [told]), done.stderr
+
+
+def test_multiruns_that_two_machines_start_in_one_folder_have_boards_of_their_own():
+    with composing():
+        folder = multirun(["-m", "seed=0,1", "run.folder=/shared/runs"]).hydra.sweep.dir
+    host = re.escape(socket.gethostname())
+    assert re.fullmatch(rf"/shared/runs/\.multirun/\d{{8}}-\d{{6}}-{host}-{os.getpid()}", folder)
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def test_absgrad_is_the_sum_of_norms_of_single_pixels(blending: str, generator: 
     """By one backward pass for each pixel, in float64; low_pass=0, as the filter's width would follow the means."""
     gaussians = mixture(3, generator, ("ordinary", "polar", "seam", "near"))
     view = View("v", identity_pose().double(), 24, 12)
-    options = RenderOptions(projection="ray", low_pass=0.0, **blended(blending, 3))
+    options = RenderOptions(projection="ray", low_pass=0.0, steepness=0.25, **blended(blending, 3))
     weights = torch.randn(12, 24, 4, generator=generator, dtype=torch.float64)
     means = gaussians.means.clone().requires_grad_()
     rendering = render(replace(gaussians, means=means), view, options, backend="torch")
@@ -54,7 +54,8 @@ def test_backends_agree(kind: str, channels: int, blending: str, backend: str, d
     gaussians = gaussians_of("huge" if kind == "broad" else kind, 25, generator)
     if kind == "broad":  # with the camera outside
         gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
-    view, options = View("v", identity_pose(), 70, 44), RenderOptions(projection="ray", **blended(blending, 4))
+    view = View("v", identity_pose(), 70, 44)
+    options = RenderOptions(projection="ray", steepness=0.25, **blended(blending, 4))
     weights = torch.randn(44, 70, channels, generator=generator, dtype=torch.float64)
     expected = absgrads(gaussians, view, options, weights, "torch")
     found = absgrads(gaussians.to(dtype), view, options, weights, backend)

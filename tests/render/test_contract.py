@@ -79,6 +79,8 @@ def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
         ({"projection": "ray", "low_pass_kind": "pixels"}, "'ray' has no .* 'pixels'; known: auto, solid, angular"),
         ({"projection": "tangent", "low_pass_kind": "pixels"}, "'tangent' has no .*; known: auto, angular, solid"),
         ({"low_pass_kind": "3d"}, "'erp' has no low_pass_kind '3d'; known: auto, pixels, angular, solid"),
+        ({"steepness": 1.5, "projection": "ray"}, r"steepness is 1.5; it must be in \[0, 1\)"),
+        ({"steepness": 0.2}, "steepness requires projection 'tangent' or 'ray', not 'erp'; set 0"),
         ({"max_instances": 0}, "max_instances is 0; it must be at least 1"),
         ({"projection": "ray", "wrap": False}, "projection 'ray' has no seam that wrap=false could cut; set wrap=true"),
         ({"projection": "tangent", "wrap": False}, "projection 'tangent' has no seam"),

@@ -217,6 +217,27 @@ def test_costs_are_compared_by_their_ratio():
     assert math.exp(evidence(timed, metric="cpu_seconds").scenes["advantage"][0]) == pytest.approx(2)
 
 
+def on_machines(*machines, seconds=None, **psnr):
+    """Runs of each preset with this PSNR, 0.1 dB more for each later seed: two seeds on each of its machines."""
+    budget = {"budget": {"seconds": seconds, "clock": "wall"}} if seconds else {}
+    made = [
+        of_experiment("equal_time", value + 0.1 * seed, preset=preset, seed=seed, machine={"gpu": machine})
+        for machine in machines
+        for preset, value in psnr.items()
+        for seed in range(2)
+    ]
+    return [replace(one, run=one.run + one.machine["gpu"], config=one.config | budget) for one in made]
+
+
+def test_sides_after_equal_time_are_of_one_machine():
+    apart = [*on_machines("slow", seconds=60.0, omnigs=25), *on_machines("fast", seconds=60.0, padgs=30)]
+    assert verdict(apart, report="equal_time") == UNMEASURED, "what a minute gives depends on the machine"
+    both = [*apart, *on_machines("fast", seconds=60.0, omnigs=31)]
+    assert evidence(both, report="equal_time").scenes["advantage"].to_list() == pytest.approx([-1])
+    counted = [*on_machines("slow", omnigs=25), *on_machines("fast", padgs=30)]
+    assert evidence(counted, report="equal_time").scenes["advantage"].to_list() == pytest.approx([5]), "of iterations"
+
+
 def test_sides_are_told_apart_by_keys():
     made = [run for tau, gain in ((0.9, -3.0), (0.0, 0.0)) for run in runs([gain, gain], "padgs", options={"tau": tau})]
     modulated, plain = ({"presets": ["padgs"], "keys": {"method.tau": tau}} for tau in (0.9, 0.0))

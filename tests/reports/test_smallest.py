@@ -60,6 +60,14 @@ def test_a_row_for_each_search_with_its_smallest_models():
     assert table(run_set(runs()[2:])).blocks == () and charts(run_set(runs()[2:])) == []
 
 
+def test_the_marks_of_the_best_numbers_are_explained():
+    seeds = [replace(one, seed=seed, run=f"{one.run}_{seed}") for one in runs()[:2] for seed in range(3)]
+    text = markdown(table(run_set(seeds)))
+    assert "| OmniGS, corrected (n=3) |" in text and "| **29.95 ± 0.00** | **30.00 ± 0.00** |" in text
+    assert text.count("- Bold: best; underlined: second, by at least 3 seeds. Rows that seeds cannot separate") == 1
+    assert "Bold" not in markdown(table(run_set(runs()[2:]))), "no table, no legend"
+
+
 def test_seeds_of_a_method_share_a_row_and_an_entry_of_the_legend():
     again = [replace(one, seed=1, run=f"{one.run}_1") for one in runs()[:2]]
     sizes = again[1].smallest["steps"][0] | {"blended": 6000}

@@ -2,10 +2,12 @@
 
 import errno
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 from support.composed import composed
 from support.made_up import result
@@ -74,3 +76,12 @@ def test_a_terminal_has_one_line_that_changes(monkeypatch):
     shown = lines(monkeypatch, terminal=True)
     assert "  8%  1  loss" in shown and "100%  12  loss" in shown
     assert shown.count("\n") <= 1
+
+
+def test_the_last_loss_that_was_read_is_shown_while_others_wait_for_a_gpu():
+    """Reading one would stop the GPU beside the clock of training; a tensor on meta raises instead."""
+    out, unread = io.StringIO(), torch.zeros((), device="meta")
+    with LiveLine(Console(file=out, width=200)) as line:
+        for iteration, loss in enumerate((unread, 0.25, unread, unread), 1):
+            line.update(Record(iteration, iteration / 4, loss, 0.0, 0.0, {}), None)
+    assert re.findall(r"%  (\d)(  loss \S+)?", out.getvalue()) == [("1", ""), ("4", "  loss 0.2500")]

@@ -1,5 +1,7 @@
 """Runs opened from Python: what they show, how they score, and what is wrong with folders that are none."""
 
+import errno
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ import padgs
 from padgs.checks import ConfigError
 from padgs.data.camera_paths import PATHS
 from padgs.data.capture import DataError
+from padgs.data.datasets import refuse_missing
 from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
 from padgs.multirun.composition import composing, configuration
@@ -135,7 +138,9 @@ def test_an_unfinished_run_is_loaded(folder, tmp_path):
     (copy / "result.json").unlink()
     run = padgs.load_run(copy)
     assert run.result is None and run.scores == {}
+    assert run.notes == ("the run has not ended; its model is that of iteration 30",)
     assert run.method.size().counts["gaussians"] > 0
+    assert padgs.load_run(folder).notes == ()
 
 
 @pytest.mark.parametrize(
@@ -202,6 +207,48 @@ def test_data_named_from_the_folder_where_training_began_are_found(tmp_path, mon
         assert all(view.mask() is not None for view in run.scene.train)
 
 
+@pytest.mark.parametrize(("named", "opened"), [("here", "here"), ("gone", "auto"), ("off", "off"), ("auto", "auto")])
+def test_a_disk_cache_of_the_machine_that_trained_is_made_anew_elsewhere(folder, tmp_path, named, opened):
+    copy = shutil.copytree(folder, tmp_path / "run")
+    (tmp_path / "here").mkdir()
+    places = {name: str(tmp_path / name) for name in ("here", "gone")}
+    settings = (copy / "config.yaml").read_text()
+    assert "disk_cache: auto" in settings
+    (copy / "config.yaml").write_text(settings.replace("disk_cache: auto", f"disk_cache: '{places.get(named, named)}'"))
+    assert padgs.load_run(copy, device="cpu").config.data.disk_cache == places.get(opened, opened)
+
+
+@pytest.fixture
+def closed(tmp_path, monkeypatch) -> Path:
+    """A folder of somebody else; the permissions of a real one do not hold for root."""
+    looked_up, place = os.stat, tmp_path / "closed"
+
+    def look_up(path, *arguments, **options):
+        if str(path).startswith(f"{place}/"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return looked_up(path, *arguments, **options)
+
+    place.mkdir()
+    monkeypatch.setattr(os, "stat", look_up)
+    return place
+
+
+def test_data_behind_a_closed_folder_are_missing_and_leave_the_configuration_readable(folder, tmp_path, closed):
+    place, copy = closed / "photographs", shutil.copytree(folder, tmp_path / "run")
+    run = padgs.load_run(copy, data_path=place, device="cpu")
+    with pytest.raises(DataError, match=f"{place} does not exist; give the folder of panoramas"):
+        assert run.scene
+    assert load._found("all.png", [place, tmp_path]) == "all.png"
+    (tmp_path / "all.png").touch()
+    assert load._found("all.png", [place, tmp_path]) == str(tmp_path / "all.png")
+
+
+def test_published_data_behind_a_closed_folder_are_missing(closed):
+    for place in (closed / "360roam" / "bar", closed / "bar"):
+        with pytest.raises(DataError, match="is missing. Get it from .*, and put it into "):
+            refuse_missing(place, "roam360")
+
+
 def test_words_are_no_names_of_folders_and_masks_may_be_inverted(tmp_path):
     for name in ("auto", "random", "none", "inverted", "people"):
         (tmp_path / name).mkdir()
@@ -224,3 +271,5 @@ def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
         padgs.load_run(tmp_path)
     with pytest.raises(ValueError, match="unknown protocol 'papre'; known: paper, sphere"):
         padgs.load_run(folder).score("papre")
+    with pytest.raises(ValueError, match="^unknown device 'gpu'; known: auto, cpu, cuda; did you mean cpu"):
+        padgs.load_run(folder, device="gpu")

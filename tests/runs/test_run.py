@@ -1,9 +1,11 @@
+import gc
 import inspect
 import io
 import json
 import os
 import shutil
 import signal
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,8 +27,10 @@ from padgs.reports.frame import frame
 from padgs.reports.selection import RunSet
 from padgs.runs import run as pipeline
 from padgs.runs.run import Callback, build_method, load_scene
-from padgs.runs.store import Labels, RunBusy, RunFolderError, labels
+from padgs.runs.store import Labels, RunBusy, RunFolderError, RunStore, labels
 from padgs.training.health import Failure
+from padgs.training.loop import Record
+from padgs.training.options import Budget
 
 PACKAGE = Path(pipeline.__file__).parents[1]
 
@@ -73,6 +77,16 @@ def test_the_log_has_losses_and_the_held_out_view(config):
     folder_of(config).resume(method)
     last = probe(method.render, load_scene(config, torch.device("cpu")).test[0])
     assert last == {name: probed[-1][name] for name in ("psnr", "polar_transmittance")}
+
+
+def test_a_loss_that_waits_for_a_gpu_is_not_logged(tmp_path):
+    """Reading it would stop the GPU beside the clock of training; a tensor on meta raises instead."""
+    log = RunStore(tmp_path)
+    for iteration, loss in enumerate((torch.zeros((), device="meta"), 0.25), 1):
+        log.log(Record(iteration, 0.5, loss, 0.125, 0.25, {"anchors": 7}), {"psnr": 21.5})
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    line = {"progress": 0.5, "seconds": 0.125, "anchors": 7, "psnr": 21.5}
+    assert lines == [{"iteration": 1, **line}, {"iteration": 2, "loss": 0.25, **line}]
 
 
 @pytest.mark.parametrize("how", ["file", "signal"])
@@ -217,6 +231,33 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     assert reasons.get(type(error), str(error)) in result.reason and "Allocator" not in result.reason
     again, said = run(config)
     assert again == result and "retry=failed" in said
+
+
+def test_a_failed_run_that_starts_again_stays_in_the_experiments_that_want_it(config, monkeypatch):
+    def fail(*_):
+        raise Failure("oom", "no memory")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PaDGSMethod, "fit", fail)
+        assert run(replace(config, labels=Labels("padgs", ("table1",))))[0].experiments == ("table1",)
+    again, _ = run(replace(config, labels=Labels("padgs", ("table4",)), retry="failed"))
+    assert (again.status, again.experiments) == ("ok", ("table1", "table4"))
+    assert results.read(folder_of(config).path / "result.json") == again
+
+
+def test_the_model_of_an_earlier_run_is_freed_before_the_next(config):
+    """Its densifier refers to it."""
+    method = build_method(composed("method=omnigs", "render.backend=torch"))
+    next(method.fit(tiny_scene(), Budget(2)))
+    model = weakref.ref(method.model)
+    gc.disable()
+    try:
+        del method
+        assert model() is not None
+        pipeline.start(config)
+        assert model() is None
+    finally:
+        gc.enable()
 
 
 def test_one_frame_lies_between_a_job_and_its_method(config, monkeypatch):

@@ -19,7 +19,7 @@ from padgs.methods.anchors.method import AnchorModel
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
 from padgs.methods.splats.splats import Splats
-from padgs.render import Rendering, render
+from padgs.render import RenderConfig, Rendering, render
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
@@ -58,22 +58,26 @@ def export_run(
     config = run.config.render
     notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
     if isinstance(model, SplatModel):
-        splats = model.baked()
-        if (world := run.method.world) is not None:
+        splats, world, as_trained = model.baked(), run.method.world, "Gaussians as trained"
+        if config.steepness:
+            splats, as_trained = _as_gaussians(run, splats, distillation_steps, progress)
+        elif world is not None:
             splats = transform_splats(splats, world.inverse())
-        as_trained = "Gaussians as trained"
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             # Square pixels, also after training with several samples: for viewers with one, this is nearer to the run.
             splats, smooth = smoothed(splats, cameras_of(run.scene.train), config.low_pass), False
             as_trained += ", including the 3D smoothing filter"
         notes.append(as_trained)
-        if distillation_steps != DISTILLATION_STEPS:
-            notes.append("--distillation-steps changes nothing: the Gaussians are no anchors")
+        if distillation_steps != DISTILLATION_STEPS and not config.steepness:
+            notes.append("--distillation-steps changes nothing: the Gaussians are written as trained")
     elif isinstance(model, AnchorModel):
         means, world = model.anchors.centers().double(), run.method.world
         _inside(means if world is None else world.inverse()(means), crop)  # before the long work
-        splats, loss = _bake_and_distill(run, distillation_steps, progress)
-        notes.append(loss)
+        options, views = config.options(run.scene.scale), _views_of_model(run)
+        splats = bake(model.anchors, views, options, config.backend, run.scene.scale)
+        words = f"baked: {len(splats)} of {run.method.size().counts['gaussians']} Gaussians are visible"
+        splats, loss = _fitted(run, splats, config, distillation_steps, progress)
+        notes.append(f"{words}; {loss}")
     else:
         raise ValueError(f"{run.config.method} has no Gaussians to export; use padgs render or padgs view")
     if smooth:
@@ -106,6 +110,8 @@ def export_run(
         rotation = Similarity.turning(up, UP)
         splats, start = transform_splats(splats, rotation), rotation(start)
         notes[notes.index(AXES)] = "units of the scene, rotated so that -y is up"
+    elif gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).axis == "+z":
+        notes.append("Vertical Axis: z")  # as in files of nerfstudio; `padgs view` reads it
     return Exported(splats, tuple(notes), start)
 
 
@@ -121,16 +127,41 @@ def _inside(means: Tensor, crop: Sequence[float] | None) -> Tensor | None:
     raise ValueError(f"no Gaussian lies in {box}; {there}, in the world of `padgs view`: change --crop")
 
 
-def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
-    scene, config, method = run.scene, run.config.render, run.method
-    options, world, views = config.options(scene.scale), method.world, sample_cameras(scene.train)
-    if world is not None:
-        views = [view.at(world.pose(view.cam_from_world)) for view in views]
-    splats = bake(method.model.anchors, views, options, config.backend, scene.scale)
-    if steps:  # on ideal renders in the world of the model
-        distill(splats, method.model.render, replace(scene, train=tuple(views)), config, steps, progress)
-    if world is not None:
-        splats = transform_splats(splats, world.inverse())
+def _views_of_model(run: LoadedRun) -> list[View]:
+    """Return cameras among the training views, in the world of the model."""
+    views, world = sample_cameras(run.scene.train), run.method.world
+    return views if world is None else [view.at(world.pose(view.cam_from_world)) for view in views]
+
+
+def _as_gaussians(run: LoadedRun, splats: Splats, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
+    """Return Gaussians for splats with a steeper response (`RenderOptions.steepness`), and what they lose.
+
+    Each covers the same area, weighted by its response, as before; then they are fitted to renders of the run.
+    """
+    config, splats = run.config.render, deepcopy(splats)
+    s = torch.tensor(config.steepness, dtype=torch.float64)
+    # Half the integral of exp(-((1 - s) q + s q^2) / 2) over q: 1 for a Gaussian.
+    area = (torch.pi / (8 * s)).sqrt() * torch.special.erfcx((1 - s) / (8 * s).sqrt())
+    splats.load(splats.rows() | {"log_scales": splats.log_scales.detach() + area.sqrt().log().item()})
+    try:
+        _ = run.scene
+    except DataError:
+        world = run.method.world
+        return splats if world is None else transform_splats(splats, world.inverse()), "Gaussians of equal area"
+    splats, loss = _fitted(run, splats, replace(config, steepness=0.0, supersampling=1), steps, progress)
+    return splats, f"Gaussians for a response of steepness {config.steepness:g}; {loss}"
+
+
+def _fitted(
+    run: LoadedRun, splats: Splats, config: RenderConfig, steps: int, progress: Callable[[int], None]
+) -> tuple[Splats, str]:
+    """Fit Gaussians in the world of the model to its renders; return them in that of the scene, and what they lose."""
+    scene, method, options = run.scene, run.method, config.options(run.scene.scale)
+    if steps:  # on ideal renders
+        views = tuple(_views_of_model(run))
+        distill(splats, method.model.render, replace(scene, train=views), config, steps, progress)
+    if method.world is not None:
+        splats = transform_splats(splats, method.world.inverse())
 
     def render_splats(view: View) -> Rendering:
         drawn = render(splats.gaussians(view), view, options, backend=config.backend)
@@ -143,10 +174,7 @@ def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None
         for render_view in (method.render, render_splats)
     )
     change = f"{abs(after - before):.2f} dB {'below' if after < before else 'above'} the run's {before:.2f} dB"
-    return splats, (
-        f"baked: {len(splats)} of {method.size().counts['gaussians']} Gaussians are visible; WS-PSNR of the {kind} "
-        f"views {after:.2f} dB, {change}"
-    )
+    return splats, f"WS-PSNR of the {kind} views {after:.2f} dB, {change}"
 
 
 @torch.no_grad()

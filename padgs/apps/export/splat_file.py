@@ -2,8 +2,8 @@
 
 A PLY holds per Gaussian x y z, nx ny nz (0; required by SIBR, the viewer of 3DGS), f_dc_0..2, f_rest_0.. (all
 coefficients of red, then green, then blue), opacity (logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z), as
-float32: the parameters of `Splats`. Harmonics have the degree of the model; programs that expect degree 3 need an
-option (`--sh_degree` of 3DGS). Padding with zeros would make small files three times as large.
+float32: the parameters of `Splats`. Harmonics have the degree of the model; for programs that read degree 3 only,
+zeros fill the others up.
 """
 
 import json
@@ -34,15 +34,18 @@ _NEEDED = [name for name in (*_POSITION, *_COLOR, *_LAST) if name != "scale_2"]
 _DISC = -9.0  # logarithm of the thickness of discs of 2DGS, which have no scale_2, relative to their smaller radius
 
 
-def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> str:
+def write_splats(
+    path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None, degree_3: bool = False
+) -> str:
     """Write Gaussians to a .ply or a format of `CONVERTED`, chosen by the suffix; only active harmonics are written.
 
-    `comments` are of a PLY header, `start` [2, 3] is the initial position and target of the viewer in an .html. Returns
-    what the format's numbers are too coarse for, if anything; where they do not hold the scene, it is a ValueError.
+    `degree_3`: a .ply has harmonics of degree 3, with zeros where the model has none. `comments` are of a PLY header,
+    `start` [2, 3] is the initial position and target of the viewer in an .html. Returns what the format's numbers are
+    too coarse for, if anything; where they do not hold the scene, it is a ValueError.
     """
     check_suffix(path)
     if not path.name.lower().endswith(CONVERTED):
-        _write_ply(path, splats, comments)
+        _write_ply(path, splats, comments, degree_3)
         return ""
     with draft_of(path.with_name(f"{path.name}-parts")) as folder:  # as large as the model
         folder.mkdir()
@@ -160,11 +163,12 @@ def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -
     return widened(splats, columns("filter_3D")[:, 0].square()) if "filter_3D" in names else splats
 
 
-def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
+def _write_ply(path: Path, splats: Splats, comments: Sequence[str], degree_3: bool = False) -> None:
     from plyfile import PlyData, PlyElement
 
     in_use = (splats.active_degree + 1) ** 2 - 1
-    rest = splats.sh_rest[:, :in_use].transpose(1, 2).flatten(1)  # [N, 3 in_use], red first
+    rest = torch.nn.functional.pad(splats.sh_rest[:, :in_use].transpose(1, 2), (0, degree_3 * (15 - in_use)))
+    rest = rest.flatten(1)  # red first
     normals = torch.zeros_like(splats.means)
     rows = (splats.means, normals, splats.sh_dc, rest, splats.opacity_logits[:, None], splats.log_scales, splats.quats)
     table = torch.cat(rows, dim=1).detach().float().cpu().contiguous().numpy()

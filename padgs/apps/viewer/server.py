@@ -15,6 +15,7 @@ import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from hashlib import sha256
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,7 +110,7 @@ def guard(token: str, *, is_local: bool) -> Iterator[list[int]]:
                 response = process_request(connection, request)  # first, because it silences logs of refusals
             except Exception:  # of any path, such as one too long for a file
                 response = connection.respond(HTTPStatus.NOT_FOUND, "")
-            cookie = f"padgs-{connection.local_address[1]}={token}"
+            cookie = f"padgs-{sha256(token.encode()).hexdigest()[:12]}={token}"  # hosts in tunnels share localhost
             given = parse_qs(request.path.partition("?")[2]).get("token", [])
             cookies = [item.strip() for line in request.headers.get_all("Cookie") for item in line.split(";")]
             has_token = any(secrets.compare_digest(one.encode(), token.encode()) for one in given)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Tracks, by_id, files_with, first_of, listed
-from padgs.data.cloud import first_ply
+from padgs.data.cloud import first_ply, forgiving
 from padgs.data.formats import colmap_files as model_files
 from padgs.data.formats.colmap_lens import lens_of, pycolmap_module
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
@@ -55,7 +55,11 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     if model is None:
         raise DataError(f"{path} holds no COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0)")
     files = {name: file for name in model_files.FILES if (file := model_files.find_file(model, name))}
-    colored = None if "points3D" in files else first_ply(model, PLY)
+    points, colored = model_files.Points({}, None), None
+    with forgiving(options.points):
+        points = model_files.read_points(files["points3D"]) if "points3D" in files else points
+    if not points.row_of and (colored := first_ply(model, PLY, options.points)):
+        points = model_files.Points({}, colored)
     needed = model_files.FILES if colored is None and options.points == "auto" else model_files.FILES[:2]
     if absent := [name for name in needed if name not in files]:
         raise DataError(
@@ -66,10 +70,8 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     cameras = by_id(model_files.read_cameras(files["cameras"]), str(files["cameras"]))
     images = sorted(model_files.read_images(files["images"]), key=lambda image: image.id)
     by_id(((image.id, (image.name, *image.pose)) for image in images), str(files["images"]))
-    points = model_files.Points({}, colored)
-    if "points3D" in files:
-        points = model_files.read_points(files["points3D"])
-    frames = tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images)
+    where = str(files["images"])
+    frames = tuple(_frame(image, cameras.get(image.camera), folder, model, where) for image in images)
     notes = _file_notes(path, model, files, colored is not None)
     tracks = partial(_tracks, images, points.row_of)
     return Capture("colmap", path, folder, frames, points.cloud, tracks=tracks, notes=tuple(notes))
@@ -83,7 +85,7 @@ def pose_of(image: model_files.Image, where: str) -> Tensor:
 
 def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) -> list[str]:
     """Say which files are used where there are several of one kind."""
-    notes = ["points: from a PLY file beside the model, which has no points3D of its own"] if colored else []
+    notes = ["points: from a PLY file beside the model, which has no points of its own"] if colored else []
     parts = [part for part in sorted(model.parent.glob("*")) if part != model and model_files.find_file(part, "images")]
     if model != path and parts:
         others = listed(part.name for part in parts)
@@ -94,8 +96,8 @@ def _file_notes(path: Path, model: Path, files: dict[str, Path], colored: bool) 
     return notes
 
 
-def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: Path, model: Path) -> Frame:
-    name = check_name(image.name, str(model_files.find_file(model, "images")))
+def _frame(image: model_files.Image, camera: model_files.Camera | None, folder: Path, model: Path, file: str) -> Frame:
+    name = check_name(image.name, file)
     where = f"{name} in {model}"
     if camera is None:
         raise DataError(f"{where} has a camera that the model does not hold; export the whole model")

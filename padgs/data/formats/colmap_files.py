@@ -18,7 +18,6 @@ from padgs.data.cloud import color_bytes, whole_if_possible
 from padgs.data.images import read_bytes
 from padgs.data.splits import read_lines
 
-NO_POINT = -1  # point of an observation without one
 FILES = ("cameras", "images", "points3D")
 PANORAMIC = ("EQUIRECTANGULAR", "SPHERICAL", "SPHERE")
 EQUIRECTANGULAR = 17  # id of the camera model in binary files

@@ -14,7 +14,7 @@ from padgs.data.cloud import initial_cloud
 from padgs.data.depths import write_depths
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import inspect, save_png
-from padgs.data.masks import write_masks
+from padgs.data.masks import MASK_FOLDERS, MAX_HIDDEN, SCENE_MASKS, write_masks
 from padgs.data.metres import KnownLength, moved, to_metres, unit_note, write_unit
 from padgs.files import draft_of
 from padgs.scene import Scene
@@ -65,6 +65,11 @@ def convert(
             for note in notes:
                 write_unit(partial, note)
             write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
+            shown = [mask.mean().item() for view in (*scene.train, *scene.test) if (mask := view.mask()) is not None]
+            if shown and 1 - min(shown) > MAX_HIDDEN:  # which loading takes for an inverted mask, unless it is named
+                name = next(path.name for path in partial.iterdir() if path.name in (SCENE_MASKS[0], MASK_FOLDERS[0]))
+                note = f"mask: pictures show small parts of the sphere; train on {destination} with data.mask={name}"
+                scene = replace(scene, notes=(*scene.notes, note))
             write_depths((*scene.train, *scene.test), partial, scale)
             WRITERS[to](content, partial)
             if destination.exists():

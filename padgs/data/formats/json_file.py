@@ -8,7 +8,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from padgs.data.capture import DataError, by_id, first_of, listed
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_name, is_inside, spellings
+from padgs.files import folded
 
 LARGEST = 2**53  # largest range of exact integers in floats
 
@@ -68,6 +70,12 @@ class Json:
         if is_inside(name) and (folder / name).is_file():
             return folder / name
         found = [folder / end for end in spellings(name) if is_inside(end) and (folder / end).is_file()]
+        if not found and is_inside(name):  # in another case or Unicode form
+            file = folder
+            for part in PurePosixPath(name.replace("\\", "/")).parts:
+                there = {} if (file / part).exists() or not file.is_dir() else _there(file, file.stat().st_mtime_ns)
+                file = file / there.get(folded(part), part)
+            found = [file] if file.is_file() else []
         if not found and not is_inside(name):
             rule = "names must be relative and stay inside the folder: put it there"
             raise DataError(f"{self.where} names {name!r}; {rule}")
@@ -91,6 +99,12 @@ class Json:
             found = type(self.value).__name__ if isinstance(self.value, (Mapping, list)) else repr(self.value)
             raise DataError(f"{self.where} must be {words}, not {found:.60}; correct it, or export the file again")
         return self.value
+
+
+@lru_cache(maxsize=64)
+def _there(folder: Path, changed: int) -> dict[str, str]:
+    """Return the names in a folder by their `folded` form; once for all names of a file, until the folder changes."""
+    return {folded(path.name): path.name for path in sorted(folder.glob("*"), reverse=True)}
 
 
 def _is_numbers(value: Any) -> bool:

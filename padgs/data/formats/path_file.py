@@ -23,24 +23,19 @@ TRANSFORMS = "dataparser_transforms.json"
 
 
 def read_path(
-    file: Path,
-    frames: int | None,
-    up: tuple[float, float, float],
-    transforms_json: Path | None = None,
-    *,
-    fps: float = 30.0,
+    file: Path, frames: int | None, up: tuple[float, float, float], transforms: Path | None = None, *, fps: float = 30.0
 ) -> Tensor:
     """Read the poses [F, 4, 4] of a file of keyframes, or a camera path of nerfstudio; a DataError names the place.
 
     Poses are resampled evenly to a number of `frames`; None: `fps` for each of the seconds that a camera path states,
     else its own poses, or one second between two keyframes. `up` is the default of keyframes with look_at.
-    `transforms_json` is the file from which the scene was read, if any.
+    `transforms` is the file from which the scene was read, if any.
     """
     if not file.exists():
         raise DataError(f"the path {file} does not exist; known: {', '.join(PATHS)}, or a JSON file")
     content = read_json(file)
     if cameras := content.get("camera_path"):
-        poses = _nerfstudio(cameras, file.parent / TRANSFORMS, transforms_json)
+        poses = _nerfstudio(cameras, file.parent / TRANSFORMS, transforms)
         if frames is None and (stated := content.get("seconds")):
             seconds = stated.numbers()
             if seconds.ndim or not 0 < seconds * fps <= MAX_FRAMES:

@@ -24,7 +24,7 @@ import torch
 
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, Frame, first_of
-from padgs.data.cloud import first_ply
+from padgs.data.cloud import first_ply, forgiving
 from padgs.data.datasets import DATASETS
 from padgs.data.formats import poses
 from padgs.data.formats.colmap import pose_of
@@ -52,7 +52,7 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
     if twice := set(split["train"]) & set(split["test"]):
         raise DataError(f"{file}: {min(twice)} is both a train and a test view; keep it in one list")
     known = DATASETS["roam360"]
-    cloud = first_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
+    cloud = first_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"), options.points)
     return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)
 
 
@@ -66,9 +66,10 @@ def read_ricoh360(path: Path, options: DataOptions) -> Capture:
         name = check_name(image.name, str(file))
         pose = pose_of(image, f"{name} in {file}")
         frames.append(Frame(name, images / name, pose, mask=mask))
-    cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
+    cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"), options.points)
     if cloud is None and (model / "points3D.txt").is_file():
-        cloud = read_points(model / "points3D.txt").cloud
+        with forgiving(options.points):
+            cloud = read_points(model / "points3D.txt").cloud
     return Capture("ricoh360", path, images, tuple(frames), cloud)
 
 
@@ -85,7 +86,7 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
         pose = poses.cam_from_opengl_pose(matrix.numbers(), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
     names = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")
-    return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, names))
+    return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, names, options.points))
 
 
 def read_ob3d(path: Path, options: DataOptions) -> Capture:
@@ -109,7 +110,7 @@ def read_ob3d(path: Path, options: DataOptions) -> Capture:
         if listing := first_of(path, (name,)):
             lines = read_list(listing)
             split[side] = tuple(f"{line.zfill(5)}_rgb.png" if line.isdecimal() else line for line in lines)
-    depth, cloud = DepthMeaning("ray", 1.0, "OB3D"), first_ply(path, ("sparse/sparse.ply",))
+    depth, cloud = DepthMeaning("ray", 1.0, "OB3D"), first_ply(path, ("sparse/sparse.ply",), options.points)
     name = "_".join(path.absolute().parts[-2:])
     return Capture("ob3d", path, images, tuple(frames.values()), cloud, split or None, depth=depth, name=name)
 

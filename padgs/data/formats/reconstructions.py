@@ -13,7 +13,7 @@ from torch import Tensor
 
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, UnknownLens, by_id
-from padgs.data.cloud import color_bytes, first_ply, whole_if_possible
+from padgs.data.cloud import color_bytes, first_ply, forgiving, whole_if_possible
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center, cam_from_world, rotation_from_vector
 from padgs.data.splits import check_name
@@ -57,7 +57,7 @@ def read_openmvg(path: Path, options: DataOptions) -> Capture:
         Frame(view.name, images / view.name, poses[view.pose], *view.size, lens=lenses.get(view.intrinsic))
         for view in posed
     )
-    if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply")):
+    if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply"), options.points):
         note = "points: from the PLY file beside sfm_data.json, which has colours"
         return Capture("openmvg", folder, images, frames, colored, notes=(note,))
     stated = data.get("structure")
@@ -84,7 +84,7 @@ def read_released(path: Path, options: DataOptions) -> Capture:
     poses = _mvg_poses(read_json(file_in(path, "data_extrinsics.json")))
     images = image_folder(path, options.images)
     frames = tuple(Frame(view.name, images / view.name, poses[view.pose]) for view in views if view.pose in poses)
-    return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply")))
+    return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply"), options.points))
 
 
 def _mvg_views(data: Json) -> list[MvgView]:
@@ -132,8 +132,10 @@ def read_opensfm(path: Path, options: DataOptions) -> Capture:
         width, height = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
         frames.append(Frame(name, images / name, pose, width, height, lens=lens))
     used = f"{file.name} holds {len(parts)} reconstructions; the one with the most shots, {len(frames)}, is used"
-    notes = (used,) if len(parts) > 1 else ()
-    return Capture("opensfm", file.parent, images, tuple(frames), _opensfm_cloud(best), notes=notes)
+    notes, cloud = (used,) if len(parts) > 1 else (), None
+    with forgiving(options.points):
+        cloud = _opensfm_cloud(best)
+    return Capture("opensfm", file.parent, images, tuple(frames), cloud, notes=notes)
 
 
 def _opensfm_cloud(part: Json) -> Cloud | None:

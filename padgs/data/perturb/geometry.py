@@ -32,7 +32,7 @@ def world_rotation(scene: Scene, degrees: float, random: np.random.Generator) ->
         pose[:3, :3] = view.cam_from_world[:3, :3] @ world.T.to(pose)
         return replace(view, cam_from_world=pose)
 
-    return replace(change_views(scene, move), points=points)
+    return replace(scene.with_views(move), points=points)
 
 
 @condition("all lengths in world units are multiplied by {}", 0.1, 10, 100, test_views=True, allowed=(0.1, 0.1, 0.1))
@@ -45,14 +45,14 @@ def world_scale(scene: Scene, factor: float, random: np.random.Generator) -> Sce
         load = view.load_depth
         return replace(view, cam_from_world=pose, load_depth=None if load is None else lambda: load() * factor)
 
-    return replace(change_views(scene, move), points=scene.points * factor)
+    return replace(scene.with_views(move), points=scene.points * factor)
 
 
 @condition("the world is {:g} scene scales away from its origin", 100, 10000, 1000000, test_views=True)
 def world_offset(scene: Scene, distance: float, random: np.random.Generator) -> Scene:
     """Move the world `distance` scene scales away from its origin, like georeferenced captures; points in float64."""
     offset = distance * scene.scale * torch.tensor(DIAGONAL, dtype=torch.float64)
-    scene = change_views(scene, lambda view: _shift(view, offset))
+    scene = scene.with_views(lambda view: _shift(view, offset))
     return replace(scene, points=scene.points.double() + offset.to(scene.points.device))
 
 
@@ -134,11 +134,6 @@ def near_points(scene: Scene, share: float, random: np.random.Generator) -> Scen
 def change_training_views(scene: Scene, change: Callable[[View], View]) -> Scene:
     """Return the scene with all training views changed."""
     return replace(scene, train=tuple(map(change, scene.train)))
-
-
-def change_views(scene: Scene, change: Callable[[View], View]) -> Scene:
-    """Return the scene with all training views changed, and then all test views."""
-    return replace(change_training_views(scene, change), test=tuple(map(change, scene.test)))
 
 
 def rotation_about(vector: Sequence[float] | np.ndarray) -> Tensor:

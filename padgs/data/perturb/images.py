@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.perturb.condition import condition
-from padgs.data.perturb.geometry import change_training_views, change_views, rotate_camera, rotation_about
+from padgs.data.perturb.geometry import change_training_views, rotate_camera, rotation_about
 from padgs.files import open_image
 from padgs.geometry.panorama import pad_panorama, project, rays, sample, sample_bicubic
 from padgs.scene import Scene, View
@@ -60,7 +60,7 @@ def seam(scene: Scene, degrees: float | str, random: np.random.Generator) -> Sce
 
         return change_pixels(rotate_camera(_panorama(view), rotation), shift, shift, shift)
 
-    return change_views(scene, turn)
+    return scene.with_views(turn)
 
 
 @condition("all cameras look down by {}°: the horizon moves to the poles", 30, 60, 90, test_views=True)
@@ -83,17 +83,11 @@ def pitch(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
 
         return change_pixels(rotate_camera(_panorama(view), rotation), colors, weights, nearest)
 
-    return change_views(scene, turn)
+    return scene.with_views(turn)
 
 
 @condition(
-    "{:.0%} of the fine contrast is gone",
-    0.5,
-    0.8,
-    0.95,
-    test_views=True,
-    metric="depth_error",
-    allowed=(0.1, 0.15, 0.3),
+    "{:.0%} of fine contrast is gone", 0.5, 0.8, 0.95, test_views=True, metric="depth_error", allowed=(0.1, 0.15, 0.3)
 )
 def textureless(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     """Remove a share of all fine contrast, as on bare walls."""
@@ -104,7 +98,7 @@ def textureless(scene: Scene, share: float, random: np.random.Generator) -> Scen
         coarse = _pool(pad_panorama(fine, radius), 2 * radius + 1, stride=1)
         return _to_bytes(fine.lerp(coarse, share))
 
-    return change_views(scene, lambda view: change_pixels(_panorama(view), fade))
+    return scene.with_views(lambda view: change_pixels(_panorama(view), fade))
 
 
 @condition(

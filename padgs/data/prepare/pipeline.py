@@ -32,6 +32,7 @@ from padgs.data.prepare import rig, sfm, work
 from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
 from padgs.data.prepare.work import Prepared, PrepareOptions, WorkFolder, digest_of
+from padgs.data.scans import optional_module
 from padgs.geometry.similarity import Similarity
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
@@ -45,10 +46,7 @@ Progress = Callable[[str, int, int], None]  # (one of STEPS, done, total)
 
 
 def prepare(
-    source: Path,
-    destination: Path,
-    options: PrepareOptions | None = None,
-    progress: Progress = lambda step, done, total: None,
+    source: Path, destination: Path, options: PrepareOptions | None = None, progress: Progress = lambda *_: None
 ) -> Prepared:
     """Compute poses and points of panoramas by structure from motion. Results are reproducible on one machine.
 
@@ -100,18 +98,18 @@ def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepa
         return None
     if result := work.find_result(source, destination, options):
         return result
-    what = f"{destination} exists, and was not made of {source} with these options"
-    raise DataError(f"{what}; nothing is overwritten: remove it or choose another path")
+    what = f"{destination} exists, and was not made of {source} with these options; nothing is overwritten"
+    holds = source.resolve().is_relative_to(destination.resolve())
+    raise DataError(f"{what}: {'it holds the input:' if holds else 'remove it or'} choose another path")
 
 
 class _Job:
-    def __init__(
-        self, source: Path, destination: Path, place: Path, options: PrepareOptions, progress: Progress
-    ) -> None:
-        self.destination, self.work, self.options, self.progress = destination, place, options, progress
+    def __init__(self, source: Path, target: Path, place: Path, options: PrepareOptions, progress: Progress) -> None:
+        self.destination, self.work, self.options, self.progress = target, place, options, progress
         self.folder = WorkFolder(place)
         given = None
         if is_video(source):
+            optional_module("av", source, "video")  # before the file is read
             of_video = work.fingerprint(source, options)
             given = digest_of(of_video, options)
             self.folder.open("video", f"{of_video.partition('|')[0]}|{options.per_second}")
@@ -177,7 +175,8 @@ class _Job:
         progress = partial(self._progress, "features")
         sfm.extract_features(self.database, self.feature_images, self._groups(), given, self.threads, progress)
         if self.options.accurate:
-            sfm.make_rig(self.database, rig.rig_config())
+            with pycolmap_module().Database.open(self.database) as entries:
+                pycolmap_module().apply_rig_config([rig.rig_config()], entries)
 
     def _groups(self) -> list[sfm.Group]:
         """Group images that share a camera: panoramas of one size, or one view of all panoramas."""

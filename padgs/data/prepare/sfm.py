@@ -88,12 +88,6 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
     return cameras
 
 
-def make_rig(database: Path, config: Any) -> None:
-    """Group the images of the database into rigs."""
-    with pycolmap_module().Database.open(database) as entries:
-        pycolmap_module().apply_rig_config([config], entries)
-
-
 def match(
     database: Path, pairs: Sequence[Sequence[tuple[str, str]]], rig: bool, threads: int, seed: int, progress: Progress
 ) -> None:

@@ -15,16 +15,16 @@ from PIL import Image
 
 from padgs.data import images as image_files
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
-from padgs.data.capture import Capture, DataError, Frame, Progress, listed
+from padgs.data.capture import Capture, DataError, Frame, Progress, first_of, listed
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
-from padgs.data.masks import SCENE_MASKS, Mask, find_masks, is_of_masks
+from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks, is_of_masks, mask_path
 from padgs.data.scans import optional_module
 from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
-UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # raw files of 360-degree cameras
+UNSTITCHED = (".insp", ".insv", ".osv", ".360", ".dng")  # raw files of 360-degree cameras
 UNSUPPORTED = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
 _NOT_STITCHED = "is not stitched: export panoramas, or a 2:1 video, with the camera's own program"
 _WAYS_OUT = (  # suffixes of unsupported files, and what to do with them
@@ -152,9 +152,10 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{path} {_NOT_STITCHED}")
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
-    every = panoramas(path)
+    given = mask_path(mask.removeprefix("inverted:"), path)
+    every = panoramas(path, given)
     folder = path if any("/" not in name for name in every) else image_folder(path, None)
-    names = [check_name(name, str(folder)) for name in panoramas(folder)]
+    names = [check_name(name, str(folder)) for name in panoramas(folder, given)]
     others, ways_out = _others(folder)
     if len(names) < 2:
         found = f"{folder} holds {len(names)} images{f' (left out: {others})' if others else ''}"
@@ -169,6 +170,8 @@ def find_source(path: Path, mask: str) -> Source:
     no_pose = torch.eye(4, dtype=torch.float64)
     place = Path(os.path.abspath(path))  # of "." too
     expected = place.parent if place.name.lower() == "images" and folder == path else path  # of masks
+    if mask in ("auto", "inverted") and not first_of(expected, (*SCENE_MASKS, *MASK_FOLDERS), Path.exists):
+        expected = folder if first_of(folder, SCENE_MASKS) else expected
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
     capture = Capture("images", expected, folder, frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
@@ -188,10 +191,12 @@ def find_source(path: Path, mask: str) -> Source:
     return Source(images, used, hashlib.sha256(identity.encode()).hexdigest(), tuple(notes))
 
 
-def panoramas(folder: Path) -> list[str]:
-    """Return the panoramas below a folder, relative to it and sorted, without masks."""
-    others = (*SCENE_MASKS, OVERLAY)
+def panoramas(folder: Path, masks: Path | None = None) -> list[str]:
+    """Return the panoramas below a folder, relative to it and sorted, without masks; `masks` has some of them."""
+    others, root, place = (*SCENE_MASKS, OVERLAY), folder.resolve(), masks and masks.resolve()
+    inner = place.relative_to(root).as_posix() if place and root in place.parents else ""
     names = [name for name in image_names(folder) if not is_of_masks(name)]
+    names = [name for name in names if not (inner and PurePosixPath(name).is_relative_to(inner))]
     return [name for name in names if PurePosixPath(name).name.lower() not in others]
 
 

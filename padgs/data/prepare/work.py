@@ -9,15 +9,15 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from padgs.checks import check, check_known
 from padgs.clock import cores, linux_value
 from padgs.data.assemble import PREPARED
-from padgs.data.capture import DataError
-from padgs.data.masks import mask_path
+from padgs.data.capture import DataError, first_of
+from padgs.data.masks import SCENE_MASKS, mask_path
 from padgs.data.metres import KnownLength
 from padgs.data.prepare.pairs import PAIRS
 from padgs.data.prepare.sfm import MAPPERS
@@ -27,6 +27,7 @@ PER_SECOND = 2.0
 LOCK = ".lock"  # of the process that works in the folder
 MAX_THREADS = 8
 MEMORY_PER_THREAD = 600_000_000  # bytes, for panoramas of 2048 x 1024, and for matching any size
+CGROUP = Path("/sys/fs/cgroup")
 MAX_SIDE = 3200  # pixels; pycolmap reduces larger images to this
 MIN_FREE_DISK = 128 << 20  # bytes, several times the output of a batch of features or matches
 
@@ -41,9 +42,14 @@ def threads_for(width: int, height: int) -> int:
 
 
 def free_memory() -> int | None:
-    """Return the free memory in bytes, or None where that is not known."""
+    """Return the free memory in bytes, of a container's limit too; None where that is not known."""
     kilobytes = linux_value("/proc/meminfo", "MemAvailable").partition(" ")[0]
-    return 1024 * int(kilobytes) if kilobytes else None
+    free = [1024 * int(kilobytes)] if kilobytes else []
+    with suppress(OSError, ValueError, KeyError):  # there is no cgroup, or its limit is "max"
+        statistics = dict(line.split() for line in (CGROUP / "memory.stat").read_text().splitlines())
+        used = int((CGROUP / "memory.current").read_text()) - int(statistics["file"])  # the page cache can be freed
+        free.append(max(0, int((CGROUP / "memory.max").read_text()) - used))
+    return min(free, default=None)
 
 
 def refuse_full(folder: Path) -> None:
@@ -104,6 +110,8 @@ def check_options(source: Path, options: PrepareOptions) -> None:
     if not is_video(source):
         if options.per_second != PER_SECOND:
             raise DataError(f"--per-second {options.per_second:g}: {source} is no video; leave it out")
+    elif options.mask == "auto" and (beside := first_of(source.parent, SCENE_MASKS)):
+        raise DataError(f"{beside} lies beside the video: use it with --mask {beside}, or not with --mask none")
     elif options.mask == "inverted":
         raise DataError("--mask inverted: a video has no masks of its own; give their path: --mask inverted:PATH")
     elif options.known.gps:

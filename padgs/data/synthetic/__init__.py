@@ -11,7 +11,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import asdict, dataclass
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -131,13 +131,8 @@ def cache_folder(options: SyntheticOptions) -> Path:
     fit its digest is generated again. Without write access there is no cache.
     """
     digest = hashlib.sha256(json.dumps(asdict(options), sort_keys=True).encode())
-    digest.update(_source())
+    digest.update(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.iterdir()) if path.is_file()))
     return cache_root() / "synthetic" / digest.hexdigest()[:24]
-
-
-@cache
-def _source() -> bytes:
-    return b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.iterdir()) if path.is_file())
 
 
 def _digest(entry: Path) -> str:

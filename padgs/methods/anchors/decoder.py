@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from padgs.gaussians import Gaussians
 from padgs.methods.anchors import native_decoder
@@ -98,9 +98,7 @@ def take_rows(table: Tensor, rows: Tensor) -> Tensor:
 class Decoder(nn.Module):
     """Weights of the three networks, initialised as torch.nn.Linear."""
 
-    def __init__(
-        self, inputs: int, offsets: int, hidden: int = 32, *, generator: torch.Generator | None = None
-    ) -> None:
+    def __init__(self, inputs: int, offsets: int, hidden: int = 32, *, generator: Generator | None = None) -> None:
         """Build networks from `inputs` values per anchor to `offsets` Gaussians, with one hidden layer."""
         super().__init__()
         values = (OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES)

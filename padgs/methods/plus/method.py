@@ -24,6 +24,7 @@ from padgs.training.loop import Stage, Trainer
 from padgs.training.model import Model
 from padgs.training.options import Budget, TrainOptions
 
+STEEPNESS = 0.25  # of the response: flatter in the middle and shorter than a Gaussian (`padgs.render.contract`)
 PIXEL_VARIANCE = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 ROUNDS = 8  # of densification
 DENSIFIED_SHARE = 0.4  # of the run, after which no Gaussians are added
@@ -124,7 +125,7 @@ class PlusMethod(SplatMethod):
 
     Options = PlusOptions
     MODEL = PlusModel
-    RENDER = RenderConfig(projection="ray", low_pass=PIXEL_VARIANCE, supersampling=2)
+    RENDER = RenderConfig(projection="ray", low_pass=PIXEL_VARIANCE, supersampling=2, steepness=STEEPNESS)
     TRAIN = TrainOptions(weight="solid_angle", square_weight=20.0, random_background=True, adam_beta2=0.99)
 
     @property

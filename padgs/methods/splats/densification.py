@@ -47,7 +47,7 @@ class DensificationOptions:
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
     sample_clones: bool = False  # clones are placed at random inside the Gaussian, not exactly on it (GOF)
     # random: two pieces at random inside the Gaussian (3DGS). long_axis: two along its longest axis, which together are
-    # as opaque in the middle as it was (Improved-GS).
+    # as opaque in the middle as it was, up to 0.85 (Improved-GS).
     split: str = "random"
     min_opacity: float = 0.005  # fainter Gaussians are pruned
     opacity_decay: float = 0.0  # subtracted from all opacities in every round
@@ -110,7 +110,7 @@ class Densifier:
         self.splats, self.options, self.extent, self._extents = splats, options, extent, extents
         self._target = target
         self.generator = torch.Generator().manual_seed(seed)
-        self.statistics = self._empty()
+        self.reset_statistics()
 
     def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
         """Add one view to the statistics: positional gradient [N, 2], [N, 3] or [N, 4], and visible [N] bool."""
@@ -123,7 +123,9 @@ class Densifier:
 
     def reset_statistics(self) -> None:
         """Set the statistics to 0, for the present number of Gaussians."""
-        self.statistics = self._empty()
+        zeros = self.splats.means.new_zeros(len(self.splats))
+        more = ["absolute"] if self.options.positional_gradient == "space_absolute" else []
+        self.statistics = {name: zeros.clone() for name in ("gradient", "seen", *more)}
 
     @torch.no_grad()
     def adapt(
@@ -251,11 +253,6 @@ class Densifier:
         lowered = torch.logit(torch.sigmoid(logits) * highest / rendered)
         logits.copy_(torch.where(rendered > highest, lowered, logits))
         forget_moments(logits, optimizer)
-
-    def _empty(self) -> dict[str, Tensor]:
-        zeros = self.splats.means.new_zeros(len(self.splats))
-        more = ["absolute"] if self.options.positional_gradient == "space_absolute" else []
-        return {name: zeros.clone() for name in ("gradient", "seen", *more)}
 
 
 def _largest(values: Tensor, count: int) -> Tensor:

@@ -98,11 +98,12 @@ class SplatModel:
         """Render all Gaussians, differentiably; `mean_offsets` of another render get the sum of both gradients."""
         splats, kind = self.splats, self.densifier.options.positional_gradient
         offsets = mean_offsets
+        # Later the gradients of offsets are not used. A warm start begins after the last step.
+        observes = self._step % self.iterations + 1 < self.densifier.options.densify_until
         if offsets is None:
-            offsets = splats.means.new_zeros(len(splats), OFFSET_COLUMNS[kind], requires_grad=True)
-        gaussians, absolute = splats.displaced(view, None if kind == "image" else offsets)
+            offsets = splats.means.new_zeros(len(splats), OFFSET_COLUMNS[kind], requires_grad=observes)
+        gaussians, absolute = splats.displaced(view, offsets if observes and kind != "image" else None)
         gaussians, options = self._training_gaussians(gaussians), self.render_options(view)
-        options = replace(options, supersampling=self._training_samples)
         if kind == "image":
             rendering = self._rendered(gaussians, view, options, mean_offsets=offsets)
         else:
@@ -118,8 +119,10 @@ class SplatModel:
         return gaussians if self._filter is None else self._filter(gaussians)
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
-        assert drawing.mean_offsets.grad is not None, "observe is called after draw and backward"
-        self.densifier.observe(drawing.mean_offsets.grad, drawing.rendering.visible, iteration)
+        gradient = drawing.mean_offsets.grad
+        assert gradient is not None or not drawing.mean_offsets.requires_grad, "observe is called after backward"
+        if gradient is not None:
+            self.densifier.observe(gradient, drawing.rendering.visible, iteration)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, prune by importance, and activate the next SH degree, each when it is due."""
@@ -262,15 +265,13 @@ class SplatModel:
         variances = added * finest_pixels(splats.means, cameras).square()
         if self._config.resolved_low_pass_kind == "solid":
             low_pass = torch.tensor([self.render_options(view).low_pass for view in self._views]).to(cameras)
-            cameras[:, 3] *= (
-                self._training_samples / low_pass.sqrt()
-            )  # the low-pass of a sample is one square pixel now
+            cameras[:, 3] *= self._samples / low_pass.sqrt()  # the low-pass of a sample is one square pixel now
             variances = variances + finest_pixels(splats.means, cameras).square()
         return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), variances)[1]
 
     @property
-    def _training_samples(self) -> int:
-        """Samples along each side of a pixel in the next training render."""
+    def _samples(self) -> int:
+        """Samples along each side of a pixel at this step of the schedule."""
         begins = self.options.supersampling_from * self.iterations
         return 1 if self._step < begins else self._config.supersampling
 
@@ -281,4 +282,4 @@ class SplatModel:
 
     def render_options(self, view: View) -> RenderOptions:
         """Return the renderer options for a view."""
-        return self._config.options(self.splats.scene_scale)
+        return replace(self._config.options(self.splats.scene_scale), supersampling=self._samples)

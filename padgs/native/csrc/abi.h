@@ -42,6 +42,7 @@ struct Camera {
   float off_panorama;    // of a table: largest angle in radians to the rays of a panorama; < 0: arbitrary rays
   int32_t compensate;    // 1: widening lowers the opacity
   int32_t cull_ellipsoids;  // 1: ray: the whole drawn Gaussian must be beyond near_radius, not only its mean
+  float steepness;          // of the response of projective footprints; see padgs/render/contract.py
 };
 
 // One projected Gaussian as the blender reads it: a cache line.
@@ -99,6 +100,7 @@ struct BlendArguments {
   TileGrid grid;
   int32_t projection, wrap;
   int32_t core_size;  // hybrid blending with this many sorted fragments; 0: sorted blending
+  float steepness;    // as in Camera
   Rays rays;
   const Footprint *footprints;           // [N]
   const int64_t *tile_start;             // [tiles + 1] over the drawn tiles

@@ -147,12 +147,9 @@ class _Image(native.NativeImage):
         self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
     ) -> Tensor | None:
         pose_gradient = torch.zeros(12, dtype=torch.float64) if needs_pose else None
-        cpu.library().padgs_project_backward(
-            ctypes.byref(self._projected.camera),
-            ctypes.byref(inputs),
-            pointer(sums),
-            ctypes.byref(abi.Gradients(*map(pointer, (*gradients, pose_gradient)))),
-        )
+        out = abi.Gradients(*map(pointer, (*gradients, pose_gradient)))
+        camera, given, found = map(ctypes.byref, (self._projected.camera, inputs, out))
+        cpu.library().padgs_project_backward(camera, given, pointer(sums), found)
         return pose_gradient
 
     def _blend_arguments(
@@ -163,7 +160,7 @@ class _Image(native.NativeImage):
         lists = (projected.footprints, strip.tile_start, strip.instances, background)
         outputs = (*pixels, self._last, pair_counts)
         core_size = options.core_size if options.blending == "hybrid" else 0
-        scalars = (projected.camera.projection, projected.camera.wrap, core_size)
+        scalars = (projected.camera.projection, projected.camera.wrap, core_size, options.steepness)
         return abi.BlendArguments(strip.grid, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
 
 

@@ -231,7 +231,7 @@ class _Image(NativeImage):
         projected = self._projected
         lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
         outputs = (*pixels, self._last, self._core, self._tails, pair_counts)
-        scalars = (projected.camera.projection, projected.camera.wrap, self._core_size)
+        scalars = (projected.camera.projection, projected.camera.wrap, self._core_size, projected.camera.steepness)
         return cuda.BlendInputs(strip.table, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
 
 

@@ -224,6 +224,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         deviation,
         low_pass.compensate,
         options.near_cull == "ellipsoid",
+        options.steepness,
     )
 
 

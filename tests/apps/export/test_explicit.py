@@ -1,6 +1,7 @@
 """`padgs export`: from a run to a file and back; transforms of Gaussians."""
 
 import math
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ import padgs
 from padgs.apps.export import explicit
 from padgs.apps.export.explicit import UNSMOOTHED, UP, export_run, harmonics_rotation, transform_splats
 from padgs.apps.export.splat_file import read_splats
+from padgs.apps.external import open_model
 from padgs.cli.commands import app
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
@@ -141,6 +143,36 @@ def test_anchors_are_baked_and_the_loss_is_reported(tmp_path_factory, tmp_path):
     (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments if line.startswith("baked")]
     assert line in result.output and "WS-PSNR of the test views" in line
     assert len(read_splats(tmp_path / "a.ply")) > 0
+
+
+def test_the_export_of_a_run_that_trains_says_of_which_iteration_it_is(splat_run, tmp_path):
+    copy = shutil.copytree(splat_run, tmp_path / "run")
+    (copy / "result.json").unlink()
+    for folder, count in ((copy, 1), (splat_run, 0)):
+        result = export(str(folder), "--to", str(tmp_path / "a.ply"))
+        said = " ".join(result.output.split())
+        assert result.exit_code == 0 and said.count("the run has not ended; its model is that of iteration 30") == count
+
+
+def test_harmonics_are_filled_up_on_request(splat_run, tmp_path):
+    """For programs that read degree 3 only."""
+    rests = []
+    for options in ((), ("--degree-3",)):
+        assert export(str(splat_run), "--to", str(tmp_path / "a.ply"), *options).exit_code == 0
+        names = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data.dtype.names
+        rests.append(sum(name.startswith("f_rest_") for name in names))
+    assert rests == [24, 45]
+
+
+def test_the_file_says_which_axis_is_up_for_viewers_of_it_alone(splat_run, tmp_path):
+    up = (UP, (0.0, 0.0, 1.0))
+    for upright in (True, False):
+        options = ("--upright", "--to") if upright else ("--to",)
+        assert export(str(splat_run), *options, str(tmp_path / "a.ply")).exit_code == 0
+        comments = PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments
+        assert ("Vertical Axis: z" in comments) != upright
+        (view,) = open_model(str(tmp_path / "a.ply"), device="cpu").scene.train
+        assert tuple(-view.cam_from_world[1, :3]) == up[not upright], "y of the camera is down"
 
 
 @pytest.mark.parametrize("camera", ["train.poses=learned_fast", "train.lens=map"])

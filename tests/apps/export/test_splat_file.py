@@ -8,6 +8,7 @@ import torch
 from numpy.lib import recfunctions as rfn
 from plyfile import PlyData, PlyElement
 from support.splat_cases import random_splats
+from support.tiny_scene import tiny_scene
 
 from padgs.apps.export import splat_file
 from padgs.apps.export.splat_file import read_splats, write_splats
@@ -36,6 +37,24 @@ def test_columns_of_3dgs(tmp_path, generator):
     splats.active_degree = 1
     write_splats(tmp_path / "a.ply", splats)
     assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
+
+
+@pytest.mark.parametrize(("degree", "active"), [(0, 0), (2, 1), (3, 2), (3, 3)])
+def test_harmonics_up_to_degree_3_are_filled_up_with_zeros(degree, active, tmp_path, generator):
+    splats = random_splats(degree, generator)
+    splats.active_degree = active
+    write_splats(tmp_path / "a.ply", splats, degree_3=True)
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    names = [name for name in vertex.data.dtype.names if name.startswith("f_rest_")]
+    rest = torch.stack([torch.from_numpy(vertex[name].copy()) for name in names], 1).view(-1, 3, 15)  # red first
+    in_use = (active + 1) ** 2 - 1
+    assert names == [f"f_rest_{number}" for number in range(45)] and not rest[:, :, in_use:].any()
+    assert torch.equal(rest[:, :, :in_use], splats.sh_rest[:, :in_use].mT)
+    found, view = read_splats(tmp_path / "a.ply", unit=splats.scene_scale), tiny_scene().train[0]
+    assert found.active_degree == 3
+    torch.testing.assert_close(found.gaussians(view).colors, splats.gaussians(view).colors)
+    write_splats(tmp_path / "b.ply", splats)
+    assert read_splats(tmp_path / "b.ply").active_degree == active
 
 
 def test_the_header_suits_the_viewer_of_3dgs(tmp_path, generator):

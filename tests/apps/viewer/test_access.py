@@ -1,5 +1,6 @@
 """Access to the viewer: foreign pages, tokens, and values that the page does not offer."""
 
+import hashlib
 import http.client
 import threading
 import time
@@ -34,6 +35,11 @@ WEBSOCKET = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Ver
 WEBSOCKET |= {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
 
 
+def cookie_of(token: str) -> str:
+    """Return the cookie that keeps a token; its name does not tell the token."""
+    return f"padgs-{hashlib.sha256(token.encode()).hexdigest()[:12]}={token}"
+
+
 def status(port: int, path: str, headers: dict[str, str]) -> int:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     connection.request("GET", path, headers=headers)
@@ -58,7 +64,7 @@ def server(request):
 @pytest.mark.parametrize("websocket", [{}, WEBSOCKET, WEBSOCKET | {"Upgrade": "WebSocket"}])
 def test_only_own_pages_with_the_token_are_served(server, websocket):
     port, token = server.viser.get_port(), server.address.partition("=")[2]
-    ask, host, cookie = partial(status, port), f"localhost:{port}", {"Cookie": f"a=b; padgs-{port}={token}"}
+    ask, host, cookie = partial(status, port), f"localhost:{port}", {"Cookie": f"a=b; {cookie_of(token)}"}
     served = {200} if not websocket else {101}
     if websocket.get("Upgrade") == "WebSocket":
         served |= {200}  # viser takes only the lower case for a websocket
@@ -78,7 +84,8 @@ def test_only_own_pages_with_the_token_are_served(server, websocket):
         "/" + 4000 * "a",
     ):
         assert ask(path, own) == 403
-    for forged in (f"padgs-{port}=", f"padgs-{port + 1}={token}", token, ";;=;"):
+    name = cookie_of(token).partition("=")[0]
+    for forged in (f"{name}=", f"{name}x={token}", f"padgs-{port}={token}", token, ";;=;"):
         assert ask("/", own | {"Cookie": forged}) == 403
     for origin in ("null", "http://evil.example", f"http://{host}.evil.example", "http://localhost:1", ""):
         for path, headers in ((right, own), ("/", own | cookie)):
@@ -88,13 +95,30 @@ def test_only_own_pages_with_the_token_are_served(server, websocket):
     assert (ask(right, foreign) == 403) == server.is_local, "in a network this machine has any name"
 
 
-def test_the_cookie_belongs_to_own_pages(server):
+def headers_of(server) -> http.client.HTTPMessage:
+    """Return what a browser gets with the page."""
     connection = http.client.HTTPConnection("127.0.0.1", server.viser.get_port(), timeout=20)
     connection.request("GET", "/?" + server.address.partition("?")[2])
-    response = connection.getresponse()
-    assert {"HttpOnly", "SameSite=Strict"} <= {*response.headers["Set-Cookie"].split("; ")}
-    assert response.headers["X-Frame-Options"] == "DENY"
+    headers = connection.getresponse().headers
     connection.close()
+    return headers
+
+
+def test_the_cookie_belongs_to_own_pages(server):
+    headers = headers_of(server)
+    parts = headers["Set-Cookie"].split("; ")
+    assert parts[0] == cookie_of(server.address.partition("=")[2]) and {"HttpOnly", "SameSite=Strict"} <= {*parts}
+    assert headers["X-Frame-Options"] == "DENY"
+
+
+def test_servers_of_two_machines_at_one_port_have_cookies_of_their_own():
+    """Tunnels bring both to localhost, where browsers keep one cookie of a name, whatever the port."""
+    cookies = []
+    for _ in range(2):
+        with start_server(port=8486) as server:
+            cookies.append(headers_of(server)["Set-Cookie"].partition("=")[0])
+            assert server.viser.get_port() == 8486
+    assert cookies[0] != cookies[1]
 
 
 def test_tokens_differ_and_servers_without_a_guard_are_stopped(monkeypatch):

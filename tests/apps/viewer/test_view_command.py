@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -44,6 +45,22 @@ def test_the_next_command_is_named_at_its_end_and_after_no_error(tmp_path, monke
     monkeypatch.setattr(process, "serve", MagicMock(side_effect=ends))
     done = CliRunner().invoke(app, ["view", str(tmp_path)])
     assert (done.exit_code, f"next: padgs render {tmp_path}" in done.stdout) == (code, is_named), done.output
+
+
+def test_no_run_is_opened_before_all_have_a_checkpoint(tmp_path, monkeypatch):
+    """What is opened while another one is waited for is old by then."""
+    done = []
+    scene = SimpleNamespace(name="room")
+    opened = lambda path, *_: done.append(("open", path)) or SimpleNamespace(notes=(), scene=scene)  # noqa: E731
+    monkeypatch.setattr(process, "wait_for_checkpoint", lambda folder: done.append(("wait", folder)))
+    monkeypatch.setattr("padgs.apps.external.open_model", opened)
+    monkeypatch.setattr(process, "serve", lambda load_runs, **_: load_runs())
+    folders = [str(tmp_path / name) for name in ("one", "other")]
+    for folder in folders:
+        Path(folder).mkdir()
+        (Path(folder) / "config.yaml").touch()
+    assert CliRunner().invoke(app, ["view", folders[0], "--beside", folders[1]]).exit_code == 0
+    assert done == [(step, folder) for step in ("wait", "open") for folder in folders]
 
 
 def test_the_page_is_served_before_torch_is_loaded():

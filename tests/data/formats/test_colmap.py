@@ -228,6 +228,19 @@ def test_points_may_be_a_ply_file_beside_the_model(world: World, tmp_path: Path)
     assert "points: from a PLY file beside the model" in _notes(tmp_path)
 
 
+@pytest.mark.parametrize("points", ["", "# none\n"])
+def test_a_ply_file_stands_in_for_a_model_without_points(points: str, world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    write_cloud(world, tmp_path / "sparse/0/points3D.ply")
+    (tmp_path / "sparse/0/points3D.txt").write_text(points)
+    scene = load(tmp_path)
+    assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
+    assert "points: from a PLY file beside the model, which has no points of its own" in scene.notes
+    (tmp_path / "sparse/0/points3D.txt").write_text("1 2\n")
+    with pytest.raises(DataError, match=r"points3D.txt, line 1: '1 2' is not ID"):
+        load(tmp_path)
+
+
 def test_text_and_binary_in_one_folder(world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
     (tmp_path / "sparse/0/images.txt").write_text("1 0 0 0 0 0 0 0 1 other.png")

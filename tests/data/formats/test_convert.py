@@ -94,6 +94,32 @@ def test_masks_per_image_and_the_rule_of_360roam(world: World, tmp_path: Path) -
     assert [name for name, mask in found.items() if mask is not None] == ["pano_02"]
 
 
+@pytest.mark.parametrize("rows", [0, 3])
+def test_masks_of_narrow_pictures_are_named_for_training(rows: int, narrow: Path, tmp_path: Path) -> None:
+    if rows:  # of one picture, are hidden in addition
+        (narrow / "masks").mkdir()
+        mask = Image.fromarray(np.repeat(np.uint8([255, 0]), [96 * (32 - rows), 96 * (16 + rows)]).reshape(48, 96))
+        mask.save(narrow / "masks" / "pano_00.png")
+    name = "masks" if rows else "mask.png"
+    scene = convert(narrow, tmp_path / "out", "transforms")
+    note = f"mask: pictures show small parts of the sphere; train on {tmp_path / 'out'} with data.mask={name}"
+    assert [one for one in scene.notes if "train on" in one] == [note]
+    with pytest.raises(
+        DataError, match=rf"the masks hide 83% of the sphere, .*; if that is meant, set data.mask={name}"
+    ):
+        load(tmp_path / "out")
+    written = load(tmp_path / "out", mask=name)
+    for view, before in zip(written.train, scene.train, strict=True):
+        assert torch.equal(view.mask(), before.mask()) and view.mask().sum() == 32 * (
+            16 - rows * (view.name == "pano_00")
+        )
+
+
+def test_masks_that_hide_less_are_not_named_for_training(world: World, tmp_path: Path) -> None:
+    WRITERS["roam360"](world, tmp_path / "a")
+    assert not any("data.mask" in note for note in convert(tmp_path / "a", tmp_path / "b", "transforms").notes)
+
+
 def test_reducing(world: World, tmp_path: Path) -> None:
     WRITERS["colmap"](world, tmp_path / "a")
     convert(tmp_path / "a", tmp_path / "b", "colmap", options=DataOptions(width=32))

@@ -6,10 +6,13 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from support.fixtures import WRITERS, World, make_world, write_colmap_text
+from PIL import Image
+from support.fixtures import WRITERS, World, make_world, write_cloud, write_colmap_text
 
 from padgs.data import DataError, load, read
+from padgs.data.formats.json_file import Json
 
 FILES = {
     "transforms": "transforms.json",
@@ -169,6 +172,68 @@ def test_files_that_are_not_json(name: str, small: World, tmp_path: Path) -> Non
     file.write_text("{}" if name != "opensfm" else "[]")
     with pytest.raises(DataError, match=rf"{file.name} (lacks the field|must hold)"):
         load(tmp_path / "scene")
+
+
+CLOUDS = [
+    ("colmap", "sparse/0/points3D.bin", "points3D.bin ends early"),
+    ("colmap text", "sparse/0/points3D.txt", "points3D.txt, line 1: 'damaged' is not ID"),
+    ("colmap text", "sparse/0/points3D.ply", "points3D.ply is no PLY file"),
+    ("openmvg", "colorized.ply", "colorized.ply is no PLY file"),
+    ("opensfm", "reconstruction.json", "points of entry 1 of .*reconstruction.json must be an object, not 'damaged'"),
+    ("roam360", "scene.ply", "scene.ply is no PLY file"),
+    ("ricoh360", "openMVG/scene.ply", "scene.ply is no PLY file"),
+    ("ricoh360", "output_dir/colmap/points3D.txt", "points3D.txt, line 1: 'damaged' is not ID"),
+    ("omniblender", "pcd.ply", "pcd.ply is no PLY file"),
+    ("released", "pcd.ply", "pcd.ply is no PLY file"),
+    ("transforms", "sparse_pc.ply", "sparse_pc.ply is no PLY file"),
+]
+
+
+@pytest.mark.parametrize(("name", "cloud", "message"), CLOUDS)
+def test_damaged_points_matter_only_if_they_are_used(name, cloud, message, small: World, tmp_path: Path) -> None:
+    (WRITERS | {"colmap text": write_colmap_text})[name](small, tmp_path)
+    write_cloud(small, tmp_path / "mine.ply")
+    text = "damaged"
+    if name == "opensfm":
+        text = json.dumps(changed(json.loads((tmp_path / cloud).read_text()), (1, "points"), text))
+    if cloud.endswith("points3D.ply"):
+        (tmp_path / "sparse/0/points3D.txt").unlink()
+    (tmp_path / cloud).parent.mkdir(exist_ok=True)
+    (tmp_path / cloud).write_text(text)
+    with pytest.raises(DataError, match=message):
+        load(tmp_path)
+    assert len(load(tmp_path, points="random").points) == 100_000
+    assert load(tmp_path, points="mine.ply").point_colors.tolist() == small.colors.tolist()
+
+
+def test_files_that_are_named_in_another_case_or_unicode_form_are_found(small: World, tmp_path: Path) -> None:
+    WRITERS["transforms"](small, tmp_path)
+    file = tmp_path / "transforms.json"
+    document = json.loads(file.read_text())
+    (tmp_path / "sparse_pc.ply").rename(tmp_path / "Points.PLY")
+    (tmp_path / "Masks" / "Ku\u0308che").mkdir(parents=True)
+    for i, frame in enumerate(document["frames"]):
+        frame["mask_path"] = f"masks/k\u00fcche/M{i}.png"
+        mask = np.repeat(np.uint8([255, 0]), [16 * (i + 2), 16 * (6 - i)]).reshape(8, 16)
+        Image.fromarray(mask).save(tmp_path / "Masks" / "Ku\u0308che" / f"m{i}.PNG")
+    for name in ("points.ply", ".\\POINTS.ply"):
+        file.write_text(json.dumps({**document, "ply_file_path": name}))
+        scene = load(tmp_path, split="all")
+        assert [view.mask().mean().item() for view in scene.train] == [(i + 2) / 8 for i in range(6)]
+        assert scene.point_colors.tolist() == small.colors.tolist()
+    (tmp_path / "Masks" / "Ku\u0308che" / "m3.PNG").unlink()
+    with pytest.raises(DataError, match="the mask .*masks/küche/M3.png that transforms names does not exist"):
+        load(tmp_path)
+
+
+def test_many_names_of_missing_files_take_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+    glob = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda folder, pattern: searched.append(folder) or glob(folder, pattern))
+    (tmp_path / "Masks").mkdir()
+    for i in range(100):
+        assert Json(f"masks/{i}.png", "mask_path").path_in(tmp_path) == tmp_path / "masks" / f"{i}.png"
+    assert searched == [tmp_path, tmp_path / "Masks"]
 
 
 def test_openmvg_cannot_reach_other_folders(small: World, tmp_path: Path) -> None:

@@ -331,6 +331,19 @@ def test_bad_input_is_refused(scene, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
+def test_a_destination_that_holds_the_input_is_not_to_be_removed(tmp_path):
+    noise(tmp_path / "in")
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").touch()
+    for destination, way_out in (
+        (tmp_path, "it holds the input: choose another path"),
+        (tmp_path / "in", "it holds the input: choose another path"),
+        (tmp_path / "there", "remove it or choose another path"),
+    ):
+        with pytest.raises(DataError, match=f"with these options; nothing is overwritten: {way_out}$"):
+            prepare(tmp_path / "in", destination)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "accurate"), [("flat", False), ("garden", False), ("garden", True)])
 def test_poses_of_real_panoramas_are_reproduced(shared, tmp_path, name, accurate):

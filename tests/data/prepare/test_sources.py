@@ -73,6 +73,55 @@ def test_masks_overlays_and_renders_are_not_panoramas(tmp_path):
     assert source.notes[1:] == (f"not used: kitchen/mask.png; {rule}",)
 
 
+def half(path):
+    """Save a mask that hides the lower half."""
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(np.repeat(np.uint8([255, 0]), 8 * 32).reshape(16, 32)).save(path)
+
+
+@pytest.mark.parametrize("inverted", ["", "inverted:"])
+@pytest.mark.parametrize(("file", "spec"), [("hands.png", "hands.png"), ("hide/a.png", "hide"), ("hide/b.png", "@")])
+def test_masks_that_an_option_names_are_no_panoramas(inverted, file, spec, tmp_path):
+    for name in ("a.png", "b.png"):
+        save(tmp_path / name)
+    half(tmp_path / file)
+    source = find_source(tmp_path, inverted + spec.replace("@", str(tmp_path / "hide")))
+    assert list(source.images) == ["a.png", "b.png"]
+    assert list(source.masks) == (["a.png", "b.png"] if file == "hands.png" else [Path(file).name])
+    assert [mask().mean(1).tolist() for mask in source.masks.values()] == len(source.masks) * [
+        8 * [0.0] + 8 * [1.0] if inverted else 8 * [1.0] + 8 * [0.0]
+    ]
+
+
+def test_only_what_an_option_names_is_no_panorama(tmp_path):
+    for name in ("None/a.png", "None/b.png", "none/c.png"):
+        save(tmp_path / name)
+    for spec in ("auto", "none", "rows:3/4"):
+        assert list(find_source(tmp_path, spec).images) == ["None/a.png", "None/b.png", "none/c.png"]
+    half(tmp_path / "None" / "a_mask.png")
+    beside = find_source(tmp_path / "None", str(tmp_path / "None"))
+    assert (list(beside.images), list(beside.masks)) == (["a.png", "b.png"], ["a.png"]), "the folder of the panoramas"
+
+
+def test_a_mask_of_all_panoramas_may_lie_among_them(tmp_path):
+    for name in ("images/a.png", "images/b.png"):
+        save(tmp_path / name)
+    half(tmp_path / "images" / "mask.png")
+    for place in (tmp_path, tmp_path / "images"):
+        source = find_source(place, "auto")
+        assert source.notes == ("mask: mask.png for every view",)
+        assert {name: mask().mean().item() for name, mask in source.masks.items()} == {"a.png": 0.5, "b.png": 0.5}
+        assert find_source(place, "inverted").masks["a.png"]()[8:].all()
+    half(tmp_path / "hands.png")
+    assert find_source(tmp_path, "hands.png").notes[0] == "mask: hands.png for every view"
+    (tmp_path / "hands.png").unlink()
+    half(tmp_path / "masks" / "a.png")
+    source = find_source(tmp_path, "auto")
+    assert list(source.masks) == ["a.png"] and source.notes[1].startswith(
+        "not used: mask.png; a mask of all panoramas must"
+    )
+
+
 @pytest.mark.parametrize(
     "mask", ["masks/hall/a.png", "hall/masks/a.png", "hall/masks/a.png.png", "hall/mask_a.png", "hall/a-mask.png"]
 )
@@ -152,9 +201,11 @@ def test_bad_input_is_refused(tmp_path):
             find_source(path, "auto")
 
     refused("is not a folder; give a folder of panoramas, or a video", tmp_path / "nothing")
-    (tmp_path / "VID_1.insv").write_bytes(b"a film")
-    refused("VID_1.insv is not stitched: export panoramas, or a 2:1 video, with the", tmp_path / "VID_1.insv")
-    (tmp_path / "VID_1.insv").unlink()
+    for name in ("VID_1.insv", "CAM_1.OSV"):
+        (tmp_path / name).write_bytes(b"a film")
+        for path in (tmp_path / name, tmp_path):
+            refused(f"{name} is not stitched: export panoramas, or a 2:1 video, with the", path)
+        (tmp_path / name).unlink()
     save(tmp_path / "a.png")
     refused("holds 1 images; structure from motion needs at least two$")
     (tmp_path / "IMG_1.insp").write_bytes(b"\xff\xd8")

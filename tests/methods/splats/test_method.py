@@ -63,7 +63,7 @@ def test_spags_tuned_has_the_options_of_padgs_plus_that_any_method_could_have():
     assert (tuned.train.weight, tuned.render.low_pass, tuned.render.blending) == ("solid_angle", 0.1, "sorted")
     assert (tuned.train.weight, tuned.render.supersampling) == (plus.train.weight, 1)
     assert supersampled.options == replace(tuned.options, supersampling_from=plus.options.supersampling_from)
-    assert supersampled.render == replace(plus.render, near_cull="ellipsoid")
+    assert supersampled.render == replace(plus.render, near_cull="ellipsoid", steepness=0.0)
     assert supersampled.train == tuned.train
     assert complete.options == replace(supersampled.options, length_unit=plus.options.length_unit)
     assert complete.train == replace(tuned.train, random_background=True) and complete.render == supersampled.render

@@ -7,16 +7,18 @@ import torch
 from support.composed import composed
 from support.rates import assert_log_linear
 from support.tiny_scene import tiny_scene
+from torch import Tensor
 
 from padgs.baselines.op43dgs import OP43DGSModel, OP43DGSOptions
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
+from padgs.multirun.composition import make_method
 from padgs.render import RenderConfig
 from padgs.render.projection import low_pass_filtered, low_pass_of
 from padgs.render.supersampling import with_smaller_pixels
 from padgs.runs.run import build_method
-from padgs.scene import Scene
+from padgs.scene import Scene, View
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.options import Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS
@@ -152,8 +154,8 @@ def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
     assert method.model.densifier.extent == extent
 
 
-def test_training_renders_have_more_samples_late_in_the_run():
-    """One sample a pixel before the given share, `supersampling` from then on and in the finished model."""
+def test_renders_have_more_samples_late_in_the_run():
+    """One sample a pixel before the given share, as training has; `supersampling` from then on and in the end."""
     scene = tiny_scene()
     view = scene.train[0]
 
@@ -169,7 +171,8 @@ def test_training_renders_have_more_samples_late_in_the_run():
     for step in range(10):
         drawn = model.draw(view).rendering.image
         torch.testing.assert_close(drawn, one if step < 6 else four)
-        torch.testing.assert_close(model.render(view).image, four)
+        assert model.render_options(view).supersampling == (1 if step < 6 else 2)
+        torch.testing.assert_close(model.render(view).image, drawn)
         resumed = model_with(2, 0.6)
         resumed.load_state(model.state())
         torch.testing.assert_close(resumed.draw(view).rendering.image, drawn, rtol=0, atol=0)
@@ -183,3 +186,46 @@ def test_a_start_of_several_samples_without_them_is_refused():
     with pytest.raises(ValueError, match=r"supersampling_from is 0\.5, but render\.supersampling is 1; set render"):
         build_method(composed("method=spags_sorted", "method.supersampling_from=0.5"))
     build_method(composed("method=padgs_plus", "render.supersampling=1"))  # the share of padgs_plus is its own default
+
+
+@pytest.mark.parametrize(("iterations", "samples"), [(1200, {0: 1, 839: 1, 840: 2, 1200: 2}), (1199, {0: 1, 1199: 1})])
+def test_padgs_plus_has_several_samples_in_the_last_three_tenths_of_long_runs(iterations, samples):
+    scene = tiny_scene()
+    model = make_method("padgs_plus", "method.depth_init_per_pixel=0").build_model(scene, iterations)
+    for model._step, expected in samples.items():
+        assert model.render_options(scene.train[0]).supersampling == expected
+
+
+def gradients(model: SplatModel, view: View) -> dict[str, Tensor]:
+    """Return the gradients of all parameters in the next iteration, which the model observes."""
+    drawing = model.draw(view)
+    loss = drawing.rendering.image.square().sum()
+    (loss if drawing.penalty is None else loss + drawing.penalty).backward()
+    model.observe(drawing, model._step + 1)
+    assert drawing.mean_offsets.requires_grad == bool(model.densifier.statistics["seen"].any())
+    return {name: row.grad for name, row in model.splats.rows().items()}
+
+
+@pytest.mark.parametrize("name", ["omnigs", "odgs", "op43dgs", "spags", "padgs_plus"])
+def test_after_densification_the_same_gradients_come_without_those_of_offsets(name):
+    scene, found, seen = tiny_scene(), [], []
+    for more in (0, 1):
+        model = make_method(name, "method.depth_init_per_pixel=0").build_model(scene, 400)
+        options, model.splats.active_degree = model.densifier.options, model.splats.degree
+        scales = model.splats.log_scales.data
+        scales += 0.3 * torch.randn(scales.shape, generator=torch.Generator().manual_seed(0))
+        model._step = options.densify_until - 1
+        model.densifier.options = replace(options, densify_until=options.densify_until + more)
+        found.append(gradients(model, scene.train[0]))
+        seen.append(int(model.densifier.statistics["seen"].sum()))
+    assert seen[0] == 0 < seen[1]
+    assert all(torch.equal(gradient, found[1][row]) for row, gradient in found[0].items())
+    assert all(gradient.any() for gradient in found[0].values())
+
+
+def test_a_warm_start_observes_its_first_iteration_like_any_other():
+    scene, trained, started = tiny_scene(), SplatMethod(), SplatMethod()
+    next(trained.fit(scene, Budget(400)))
+    started.warm_start(trained.state())
+    next(started.fit(scene, Budget(400)))
+    assert started.model.densifier.statistics["seen"].max() == 1

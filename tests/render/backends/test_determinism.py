@@ -28,7 +28,7 @@ RENDERINGS = {
     "cube map": ("pinhole", "panorama", {"cubemap": True}),
     "erp, hybrid": ("erp", "panorama", {"blending": "hybrid", "core_size": 8}),
     "ray, hybrid": ("ray", "panorama", {"blending": "hybrid", "core_size": 3}),
-    "ray in a pinhole": ("ray", "pinhole", {}),
+    "ray in a pinhole": ("ray", "pinhole", {"steepness": 0.3}),
     "tangent along a table": ("tangent", "fisheye", {}),
     "ray along a table": ("ray", "fisheye", {}),
 }

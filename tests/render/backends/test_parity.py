@@ -10,6 +10,7 @@ from padgs.render import RenderOptions
 CONFIGURATIONS = {
     "ours": {},
     "sharp": {"near": 0.005, "low_pass": 0.05},
+    "steep": {"steepness": 0.4},
     "no wrap": {"wrap": False},
     "published": {"near": 0.005, "wrap": False, "bounds": "square"},
 }
@@ -19,6 +20,7 @@ COMBINATIONS = [
     for name in CONFIGURATIONS
     for kind in cases.KINDS
     if not (name == "no wrap" and projection != "erp")
+    and not (name == "steep" and projection not in ("tangent", "ray"))
     and not (name == "published" and (projection == "ray" or (projection == "tangent" and lens != "panorama")))
     and not (lens == "pinhole" and kind in ("polar", "pole", "seam"))  # it sees too few of them
 ]

@@ -9,6 +9,7 @@ from support.render_cases import draw, gaussians_of, identity_pose, leaves, mixt
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.render.backends import torch as torch_backend
+from padgs.render.contract import largest_q, response
 from padgs.scene import View
 
 ENGINE = {"backend": "torch", "dtype": torch.float64}
@@ -37,6 +38,27 @@ def test_blending_by_hand():
     assert rendering.transmittance[8, 16].item() == pytest.approx(left, abs=1e-5)
     depth = (green * 1 + blue * 2 + red * 3) / (green + blue + red)
     assert rendering.depth[8, 16].item() == pytest.approx(depth, abs=1e-5)
+
+
+@pytest.mark.parametrize("steepness", [0.0, 0.3, 0.9])
+def test_the_response_is_flatter_in_the_middle_with_a_steeper_edge(steepness: float):
+    """On the horizon at angles of 0.5, 1 and 2 standard deviations; and where alpha falls to 1/255."""
+    q = torch.tensor([0.0, 0.25, 1.0, 4.0], dtype=torch.float64)
+    expected = [0.0, 0.25 - 0.1875 * steepness, 1.0, 4 + 12 * steepness]
+    assert response(q, steepness).tolist() == pytest.approx(expected, abs=1e-14)
+    opacities = torch.tensor([0.001, 1 / 255, 0.1, 0.99], dtype=torch.float64)
+    reach = largest_q(opacities, steepness)
+    assert reach[:2].tolist() == pytest.approx([0, 0], abs=1e-12)
+    assert (opacities[2:] * torch.exp(-0.5 * response(reach[2:], steepness))).tolist() == pytest.approx([1 / 255] * 2)
+    mean, size = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.2
+    quats, scales = mean.new_tensor([[1, 0, 0, 0]]), mean.new_tensor([[size, size, 1e-6]])
+    gaussians = Gaussians(mean, quats, scales, mean.new_tensor([0.8]), mean.new_ones(1, 3))
+    view, options = View("v", identity_pose(), 256, 128), RenderOptions("ray", low_pass=0.0, steepness=steepness)
+    column = 128 + 8  # half a pixel further, as row 64 is half a pixel below the horizon
+    longitude, latitude = 8.5 / 256 * 2 * math.pi, 0.5 / 128 * math.pi
+    q = (math.tan(longitude) ** 2 + (math.tan(latitude) / math.cos(longitude)) ** 2) / size**2
+    drawn = render(gaussians, view, options, backend="torch").image[64, column, 0].item()
+    assert drawn == pytest.approx(0.8 * math.exp(-0.5 * (q * (1 - steepness) + steepness * q * q)), rel=1e-5)
 
 
 def test_a_pixel_stops_before_it_is_opaque():
@@ -122,7 +144,7 @@ def test_memory_is_bounded_by_the_block(generator: torch.Generator, monkeypatch:
     [
         RenderOptions("erp"),
         RenderOptions("erp", wrap=False),
-        *(RenderOptions(projection) for projection in ("tangent", "ray")),
+        *(RenderOptions(projection, steepness=s) for projection in ("tangent", "ray") for s in (0.0, 0.4)),
         *(RenderOptions(projection, cubemap=True) for projection in ("pinhole", "tangent", "ray")),
     ],
     ids=str,

@@ -1,10 +1,12 @@
 import csv
+import json
 import math
 import re
 import time
 from dataclasses import replace
 
 import pytest
+from PIL import Image
 from support.chromium import in_chromium, visiting
 from support.made_up import at_equal_time, compared, data_set, failed, run_set, small, swept, write
 
@@ -61,6 +63,59 @@ def test_scenes_can_be_chosen_by_set_and_by_name():
     sets = page._scene_sets(runs)
     assert sets["not tuned on"] == ["plaza"] and sets["synthetic-room"] == ["synthetic-room"]
     assert sorted(sets["synthetic"]) == ["synthetic-outdoor", "synthetic-room"]
+
+
+@pytest.fixture(scope="module")
+def of_paper() -> str:
+    """A page of runs on all scenes of 360Roam, and on a built-in one."""
+    return page.html(run_set([*data_set("roam360"), *compared(["synthetic-room"], 1)]))
+
+
+def about(html: str, section: str) -> list[str]:
+    """What the parts of a section say that they are about."""
+    return re.findall(r'data-of="([^"]*)"', html.partition(f'<section id="{section}"')[2].partition("</section>")[0])
+
+
+def data_of(html: str):
+    return json.loads(html.partition('id="data">')[2].partition("</script>")[0])
+
+
+def test_a_data_set_of_the_paper_has_all_parts_with_its_title(of_paper):
+    sets = data_of(of_paper)["sets"]
+    title, *scenes = sets["360Roam"]
+    assert title == "360Roam" and {"bar", "base", "cafe"} <= {*scenes} and len(scenes) == 11
+    assert sets["360Roam, bar"] == ["bar"] and sets["synthetic"] == ["synthetic-room"], "no part has that title"
+    for section in ("table1", "table4"):
+        every = about(of_paper, section)
+        assert every[0] == "360Roam, average over its 11 scenes" and every[-1].startswith("synthetic-room")
+        assert all("360Roam" in of for of in every[:-1])
+
+
+def test_a_block_with_scenes_down_is_about_each_of_its_scenes(of_paper):
+    _, *scenes = data_of(of_paper)["sets"]["360Roam"]
+    down = dict(of.split(", 360Roam ") for of in about(of_paper, "table1") if ", 360Roam " in of)
+    assert [*down] == ["SSIM ↑", "PSNR ↑", "LPIPS VGG [0, 1] ↓"]
+    for rows in down.values():
+        assert {*scenes} <= {*rows.replace(",", "").split()} and rows.startswith("bar bar, paper ")
+
+
+def test_a_figure_is_about_the_scenes_that_its_notes_name(html):
+    assert about(html, "sweeps")[0].startswith("Sweep tau@cpu: mean and standard deviation over seeds;")
+    for section in ("charts", "sweeps"):
+        assert all("synthetic-room (generated, tuned on): protocol " in of for of in about(html, section))
+
+
+def pinhole_and_panorama(folder):
+    """A run with two test views: view0 is a panorama, view1 has 4:3 pixels."""
+    write([small(25.0, run="one")], folder, renders=True)
+    Image.new("RGB", (3 * 64, 48), "gray").save(folder / "one" / "renders" / "view1.png")
+    return page.html(RunSet(frame(store.read(folder)[0])))
+
+
+def test_views_of_pinhole_cameras_are_no_panoramas(tmp_path):
+    (scene,) = data_of(pinhole_and_panorama(tmp_path))["scenes"]
+    assert {view["title"]: view["panorama"] for view in scene["views"]} == {"view0": True, "view1": False}
+    assert all(len(view["methods"]) == 1 for view in scene["views"]), "each is shown beside its render"
 
 
 def test_names_are_text_and_not_markup():
@@ -134,7 +189,10 @@ def test_in_a_browser(html, tmp_path):
 
         page.set_viewport_size({"width": 390, "height": 844})
         assert page.evaluate("document.documentElement.scrollWidth") == 390
+        stays = "getComputedStyle(document.querySelector('#table1 tbody td')).position"
+        assert page.evaluate(stays) == "static", "names would cover the numbers"
         page.set_viewport_size({"width": 1400, "height": 1000})
+        assert page.evaluate(stays) == "sticky"
 
         before = page.evaluate("document.getElementById('slider').value")
         visit.drag("#slider", 200, 0)
@@ -168,3 +226,31 @@ def test_in_a_browser(html, tmp_path):
 
         assert visit.complaints == []
         assert {url.partition(":")[0] for url in visit.requests} <= {"file", "blob", "data"}
+
+
+@pytest.mark.slow
+@in_chromium
+def test_in_a_browser_a_pinhole_view_has_no_viewer(tmp_path):
+    (tmp_path / "report.html").write_text(pinhole_and_panorama(tmp_path / "runs"))
+    with visiting((tmp_path / "report.html").as_uri()) as visit:
+        for view, caption in (("view0", "25.00"), ("view1", "25.00"), ("view0", "25.00")):
+            visit.page.select_option("#view", label=view)
+            assert visit.page.locator("#viewer").is_visible() == (view == "view0")
+            assert caption in visit.page.locator("#slider [slot=second] figcaption").text_content()
+        visit.wait("viewers.length === 2 && viewers.every(viewer => viewer.isLoaded())")
+        assert visit.complaints == []
+
+
+@pytest.mark.slow
+@in_chromium
+def test_in_a_browser_a_data_set_of_the_paper_keeps_its_tables(of_paper, tmp_path):
+    (tmp_path / "report.html").write_text(of_paper)
+    shown = "[...document.querySelectorAll('#table1 [data-of]:not([hidden]) caption')].map(of => of.textContent)"
+    down = [f"{metric}, 360Roam" for metric in ("SSIM ↑", "PSNR ↑", "LPIPS VGG [0, 1] ↓")]
+    with visiting((tmp_path / "report.html").as_uri()) as visit:
+        mean, *parts, room = visit.page.evaluate(shown)
+        assert mean.startswith("360Roam, average") and parts == down and room.startswith("synthetic-room")
+        for label, expected in (("360Roam", [mean, *down]), ("360Roam, bar", down), ("synthetic", [room])):
+            visit.page.select_option("#set", label=label)
+            assert visit.page.evaluate(shown) == expected, label
+        assert visit.complaints == []

@@ -188,7 +188,7 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     for (int e = 0; e < count; ++e) {
       const Footprint &g = forward.footprints[entrants[e].gaussian];
       const Seen seen(g, forward, tile);
-      typename Seen::GradientSums gradient_sums;
+      typename Seen::GradientSums gradient_sums(seen);
       Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absgrad = zero();
       for (const Hit<Seen> *end = hits + entrants[e].end; hit < end; ++hit) {
         BackwardPatch &state = states[hit->patch];
@@ -240,7 +240,8 @@ void blend_backward(const BlendGradientArguments &args) {
     else if (args.grad_rays)
       backward_tile<ProjectiveFootprint, true, true, true>(args, tile);
     else if (args.absgrad)
-      backward_tile<ProjectiveFootprint, true, false, true>(args, tile);
+      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, true>(args, tile)
+                      : backward_tile<ProjectiveFootprint, false, false, true>(args, tile);
     else
       args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile)
                       : backward_tile<ProjectiveFootprint, false, false, false>(args, tile);

@@ -330,7 +330,7 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t
     const Hit<Seen> *hit = hits;
     for (int e = 0; e < count; ++e) {
       const Seen g(forward.footprints[entrants[e].gaussian], forward, tile);
-      typename Seen::GradientSums gradient_sums;
+      typename Seen::GradientSums gradient_sums(g);
       Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absgrad = zero();
       for (const Hit<Seen> *end = hits + entrants[e].end; hit < end; ++hit) {
         const Upstream &up = upstream[hit->patch];
@@ -382,7 +382,8 @@ void hybrid_backward(const BlendGradientArguments &args) {
     else if (args.grad_rays)
       backward_tile<ProjectiveFootprint, true, true, true>(args, tile, index);
     else if (args.absgrad)
-      backward_tile<ProjectiveFootprint, true, false, true>(args, tile, index);
+      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, true>(args, tile, index)
+                      : backward_tile<ProjectiveFootprint, false, false, true>(args, tile, index);
     else
       args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile, index)
                       : backward_tile<ProjectiveFootprint, false, false, false>(args, tile, index);

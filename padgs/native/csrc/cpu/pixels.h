@@ -68,6 +68,7 @@ struct PlanarFootprint {
   // those of du nearly cancel in every derivative.
   struct GradientSums {
     Vec one = zero(), t = zero(), v = zero(), tt = zero(), tv = zero(), vv = zero();
+    explicit GradientSums(const PlanarFootprint &) {}
     PADGS_ALWAYS_INLINE void add(const Factors &at, Vec m) {
       const Vec mt = m * at.t, mv = m * at.dv;
       one += m, t += mt, v += mv;
@@ -80,10 +81,10 @@ struct PlanarFootprint {
   };
 };
 
-// q from (x, y) = L d and b = m.d.
+// q from (x, y) = L d and b = m.d. With the steepness s, alpha = opacity exp(-f(q) / 2) and f(q) = (1 - s) q + s q^2.
 struct ProjectiveFootprint {
   Footprint f;
-  float red, green, blue, depth;
+  float red, green, blue, depth, steepness;
 
   static constexpr bool kOfRays = true;
   struct Place {  // directions of the pixels, or derivatives by them
@@ -121,8 +122,8 @@ struct ProjectiveFootprint {
   };
 
   ProjectiveFootprint() = default;
-  ProjectiveFootprint(const Footprint &footprint, const BlendArguments &, const Tile &)
-      : f(footprint), red(f.red), green(f.green), blue(f.blue), depth(f.depth) {}
+  ProjectiveFootprint(const Footprint &footprint, const BlendArguments &args, const Tile &)
+      : f(footprint), red(f.red), green(f.green), blue(f.blue), depth(f.depth), steepness(args.steepness) {}
   PADGS_ALWAYS_INLINE At at(const Place &p) const {
     const float *s = f.shape;
     const Vec x = p.x * s[0] + p.y * s[1] + p.z * s[2], y = p.x * s[3] + p.y * s[4] + p.z * s[5];
@@ -133,7 +134,7 @@ struct ProjectiveFootprint {
     At at;
     at.b_by_d = b * inverse;
     at.factors = {n * inverse, x * at.b_by_d, y * at.b_by_d};
-    at.log2_alpha = f.log2_opacity - at.factors.q * kHalfLog2;
+    at.log2_alpha = f.log2_opacity - at.factors.q * ((1 - steepness) + at.factors.q * steepness) * kHalfLog2;
     at.reached = both(at_least(at.log2_alpha, splat(kLog2AlphaMin)), both(less(zero(), b), less(d * s[10], b)));
     return at;
   }
@@ -146,24 +147,29 @@ struct ProjectiveFootprint {
     e.z = at.cx * s[2] + at.cy * s[5] - at.q * s[8];
     return e;
   }
-  // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/dq.
+  // f'(q)
+  PADGS_ALWAYS_INLINE static Vec growth(float steepness, Vec q) { return (1 - steepness) + q * (2 * steepness); }
+  // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/df.
   PADGS_ALWAYS_INLINE void add_ray_gradient(const Factors &at, Vec b_by_d, Vec m, Place &grad) const {
-    const Vec scale = -(m * b_by_d);
+    const Vec scale = -(m * growth(steepness, at.q) * b_by_d);
     const Place e = slope(at);
     grad.x += scale * e.x, grad.y += scale * e.y, grad.z += scale * e.z;
   }
   // |dL/dmean| of each pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
   PADGS_ALWAYS_INLINE Vec absgrad(const Factors &at, Vec m) const {
     const Place e = slope(at);
-    return magnitude(m) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
+    return magnitude(m) * growth(steepness, at.q) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
   }
 
   struct GradientSums {
     Vec m = zero(), c0 = zero(), c1 = zero(), c2 = zero();
     Vec c00 = zero(), c01 = zero(), c02 = zero(), c11 = zero(), c12 = zero(), c22 = zero();
+    float steepness;
+    explicit GradientSums(const ProjectiveFootprint &seen) : steepness(seen.steepness) {}
     PADGS_ALWAYS_INLINE void add(const Factors &at, Vec weight) {
-      const Vec w0 = weight * at.q, w1 = weight * at.cx, w2 = weight * at.cy;
       m += weight;
+      weight = weight * growth(steepness, at.q);
+      const Vec w0 = weight * at.q, w1 = weight * at.cx, w2 = weight * at.cy;
       c0 += w0, c1 += w1, c2 += w2;
       c00 += w0 * at.q, c01 += w0 * at.cx, c02 += w0 * at.cy;
       c11 += w1 * at.cx, c12 += w1 * at.cy, c22 += w2 * at.cy;

@@ -54,6 +54,7 @@ struct BlendInputs {
   TileTable table;
   int32_t projection, wrap;
   int32_t core_size;  // hybrid blending with this many sorted fragments; 0: sorted blending
+  float steepness;    // as in Camera
   Rays rays;
   const Footprint *footprints;
   const int32_t *tile_start, *slots;  // the lists: slots of each tile, front to back

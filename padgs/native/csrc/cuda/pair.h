@@ -30,6 +30,7 @@ struct ProjectivePair {
   static constexpr int kGradientSums = 10;
   float q, cx, cy, log2_alpha;
   float b_by_d;
+  float growth;  // f'(q) of the exponent -f(q) / 2, f(q) = (1 - s) q + s q^2 with the steepness s
   bool reached;
 
   // Where the Gaussian lies on the ray: for projection `ray` at its largest value there, |M^-1 mean| b / D; else at its
@@ -46,12 +47,12 @@ struct ProjectivePair {
   // |dL/dmean| of one pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
   __device__ float absgrad(const Footprint &f, float m) const {
     const Vec3<float> e = slope(f);
-    return magnitude(m) * root(dot(e, e) * f.shape[9]);
+    return magnitude(m) * growth * root(dot(e, e) * f.shape[9]);
   }
 
-  // M times 1, c and c c^T with c = (q, c_x, c_y); see projective.h.
+  // M times 1, and times f'(q), c and c c^T with c = (q, c_x, c_y); see projective.h.
   __device__ void gradient_sums(float m, float *out) const {
-    const float w0 = m * q, w1 = m * cx, w2 = m * cy;
+    const float w0 = m * growth * q, w1 = m * growth * cx, w2 = m * growth * cy;
     out[0] = m, out[1] = w0, out[2] = w1, out[3] = w2;
     out[4] = w0 * q, out[5] = w0 * cx, out[6] = w0 * cy;
     out[7] = w1 * cx, out[8] = w1 * cy, out[9] = w2 * cy;
@@ -62,7 +63,7 @@ struct PlanarPixel {
   typedef PlanarPair Pair;
   float u, v, width, turns;
 
-  __device__ PlanarPixel(const Rays &, int wrap, int columns, int x, int y)
+  __device__ PlanarPixel(const Rays &, float, int wrap, int columns, int x, int y)
       : u(float(x) + 0.5f), v(float(y) + 0.5f), width(float(columns)), turns(wrap ? 1.0f / float(columns) : 0.0f) {}
 
   __device__ PlanarPair at(const Footprint &f) const {
@@ -81,8 +82,9 @@ struct PlanarPixel {
 struct ProjectivePixel {
   typedef ProjectivePair Pair;
   Vec3<float> ray;
+  float steepness;
 
-  __device__ ProjectivePixel(const Rays &rays, int, int columns, int x, int y) {
+  __device__ ProjectivePixel(const Rays &rays, float steep, int, int columns, int x, int y) : steepness(steep) {
     if (rays.table) {
       const int64_t stride = int64_t(chunks(columns)) * kTile;
       const float *at = rays.table + 3 * stride * y + x;
@@ -105,14 +107,15 @@ struct ProjectivePixel {
     p.b_by_d = b * inverse;
     p.cx = x * p.b_by_d;
     p.cy = y * p.b_by_d;
-    p.log2_alpha = fmaf(-p.q, kHalfLog2E, f.log2_opacity);
+    p.growth = fmaf(2 * steepness, p.q, 1 - steepness);
+    p.log2_alpha = fmaf(-p.q * fmaf(steepness, p.q, 1 - steepness), kHalfLog2E, f.log2_opacity);
     p.reached = p.log2_alpha >= kLog2AlphaMin && b > 0 && b > d * s[10];
     return p;
   }
 
-  // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/dq.
+  // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/df.
   __device__ Vec3<float> ray_gradient(const Footprint &f, const ProjectivePair &p, float m) const {
-    return scaled(-(m * p.b_by_d), p.slope(f));
+    return scaled(-(m * p.growth * p.b_by_d), p.slope(f));
   }
 };
 

@@ -52,9 +52,13 @@ struct Projected {
 template <class T>
 PADGS_HD T log2_of_opacity(T opacity) { return logarithm2(larger(opacity, constant(1e-30f, opacity))); }
 
-// 2 ln(255 o), above which q is not drawn; negative where nothing is.
+// The q above which nothing is drawn, (1 - s) q + s q^2 = 2 ln(255 o) with the steepness s; negative where nothing is.
 template <class T>
-PADGS_HD T largest_q(T opacity) { return (log2_of_opacity(opacity) + 7.994353437f) * (1.0f / kHalfLog2E); }
+PADGS_HD T largest_q(T opacity, float steepness) {
+  const T k = (log2_of_opacity(opacity) + 7.994353437f) * (1.0f / kHalfLog2E);
+  const float linear = 1.0f - steepness;
+  return 2.0f * k / (linear + root(larger(linear * linear + 4.0f * steepness * k, constant(0.0f, k))));
+}
 
 template <class T>
 PADGS_HD T is_drawn(const Projected<T> &p, int bounds, T opacity, T in_front) {
@@ -115,7 +119,7 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
   const CameraGaussian<T> g = Widened<T>(camera, posed).gaussian;
   if (camera.projection == kErp) return projected_planar(camera, ErpChart<T>(camera, g.mean), g, offset);
   if (camera.projection == kPinhole) return projected_planar(camera, PinholeChart<T>(camera, g.mean), g, offset);
-  const T exact = largest_q(g.opacity), k = larger(exact, constant(0.0f, exact)) * kSlack;
+  const T exact = largest_q(g.opacity, camera.steepness), k = larger(exact, constant(0.0f, exact)) * kSlack;
   if (camera.projection == kTangent) {
     const TangentModel<T> model(g, camera.low_pass);
     const T in_front = model.frame.r - camera.near_radius;
@@ -123,7 +127,7 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
     if (camera.square) bounds.c2 = model.published_extent(camera, posed.mean);  // the cone leaves it empty
     return projected_rays(camera, model.shape(), posed.mean, bounds, g.opacity, model.frame.r, in_front);
   }
-  const RayModel<T> model(g);  // not drawn from inside: rho^2 <= 2 ln(255 o)
+  const RayModel<T> model(g);  // not drawn from inside: rho^2 <= the largest q
   T in_front = smaller(model.frame.r - camera.near_radius, model.rho * model.rho - exact);
   if (camera.cull_ellipsoids) {
     const Vec3<T> along = transposed_times(g.spread(), model.frame.normal);
