@@ -12,9 +12,9 @@ from padgs.gaussians import Gaussians
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.render import RenderConfig, Rendering, RenderOptions
+from padgs.render.projective import PUBLISHED_FOCAL
 from padgs.scene import View
 
-RELEASED_FOCAL = 512  # pixels per radian of its tangent planes, whatever the image
 INSTANCE_BYTES = 24  # per (Gaussian, tile) pair: a key of 8 bytes and a value of 4, before and after sorting
 
 
@@ -22,7 +22,7 @@ INSTANCE_BYTES = 24  # per (Gaussian, tile) pair: a key of 8 bytes and a value o
 class OP43DGSOptions(SplatOptions):
     """Options as published; those defined here are deviations of the released code."""
 
-    fixed_low_pass: bool = False  # render.low_pass is in pixels of `RELEASED_FOCAL`
+    fixed_low_pass: bool = False  # render.low_pass is in pixels of `PUBLISHED_FOCAL`
     memory_cap: int | None = None  # bytes for all (Gaussian, tile) pairs of an image; None: unlimited
 
     def __post_init__(self) -> None:
@@ -39,7 +39,7 @@ class OP43DGSModel(SplatModel):
         options = super().render_options(view)
         if not self.options.fixed_low_pass:
             return options
-        return replace(options, low_pass=options.low_pass * (view.camera.focal / RELEASED_FOCAL) ** 2)
+        return replace(options, low_pass=options.low_pass * (view.camera.focal / PUBLISHED_FOCAL) ** 2)
 
     def _rendered(self, gaussians: Gaussians, view: View, options: RenderOptions, **offsets: Any) -> Rendering:
         rendering, cap = super()._rendered(gaussians, view, options, **offsets), self.options.memory_cap

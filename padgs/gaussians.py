@@ -25,12 +25,8 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def first(self, count: int) -> Gaussians:
-        """Return the first `count` Gaussians, without a copy."""
-        return replace(self, **{f.name: getattr(self, f.name)[:count] for f in fields(self)})
-
-    def chosen(self, rows: Tensor) -> Gaussians:
-        """Return the Gaussians of some rows, given by index or mask."""
+    def chosen(self, rows: Tensor | slice) -> Gaussians:
+        """Return the Gaussians of some rows, given by index, mask or slice; of a slice without a copy."""
         return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def to(self, *args, **kwargs) -> Gaussians:

@@ -120,11 +120,7 @@ DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.m
 
 
 def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Return a configuration without the keys of DECIDE_NOTHING.
-
-    >>> decisive({"seed": 0, "run": {"threads": 2}, "data": {"path": "/x", "width": 64}})
-    {'seed': 0, 'data': {'width': 64}}
-    """
+    """Return a configuration without the keys of DECIDE_NOTHING."""
     return {
         key: decisive(value, f"{where}{key}.") if isinstance(value, Mapping) else value
         for key, value in config.items()

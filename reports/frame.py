@@ -26,7 +26,7 @@ CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
 # Options that results of before they existed, or since they ended (hold_out), do not name, and what those runs did.
 BEFORE = {"method.length_unit": "extent", "method.means_least_pace": 1.0, "train.random_background": False}
-BEFORE |= {"train.hold_out": None}
+BEFORE |= {"train.hold_out": None, "render.steepness": 0.0}
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0

@@ -33,7 +33,7 @@ F bedroom,room,basement 21 300 +experiment=all_methods ~scene_set train.iteratio
 F bedroom,room,basement 105 100 +experiment=capacity train.iterations=1500 data.width=256 seed=0,1,2
 G builtin 95 110 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=omnigs,op43dgs,spags_tuned,padgs,padgs_plus
 G builtin 40 270 +experiment=stress train.iterations=1500 data.width=256 seed=0 stress.level=2 method=$released stress.condition=none,world_rotation,seam,pitch,world_scale,few_points,pose_noise,few_views,exposure,noise
-J bedroom,flat,basement,court 44 50 +experiment=plus_ablation train.iterations=1000 data.width=256 seed=0,1
+J bedroom,flat,basement,court 46 50 +experiment=plus_ablation train.iterations=1000 data.width=256 seed=0,1
 END
 }
 

@@ -46,7 +46,7 @@ from padgs.scene import Scene, View
 METHOD = "external"  # name in results
 SPLATS = (".ply", *(suffix for suffix in CONVERTED if suffix != ".html"))
 RAYS = {
-    "exact": PlusMethod.RENDER,  # as padgs_plus
+    "exact": replace(PlusMethod.RENDER, steepness=0.0),  # as padgs_plus, but Gaussians
     # as ordinary viewers: affine footprints, widened by 0.3 square pixels of the panorama, on the faces of a cube
     "ewa": RenderConfig(projection="pinhole", cubemap=True, low_pass=0.3),
 }

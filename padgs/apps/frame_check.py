@@ -82,11 +82,7 @@ def nerfstudio_similarity(file: Path, transforms_json: Path | None) -> Similarit
 
 
 def as_numbers(similarity: Similarity) -> str:
-    """Return a similarity as an argument of --transform.
-
-    >>> as_numbers(Similarity(2.0, torch.eye(3), torch.tensor([0.0, 0.5, 1.0])))
-    '2 0 0 0  0 2 0 0.5  0 0 2 1'
-    """
+    """Return a similarity as an argument of --transform: the rows of its matrix."""
     rows = torch.cat((similarity.scale * similarity.rotation, similarity.translation[:, None]), dim=1)
     rows = torch.where(rows.abs() < 1e-9, 0.0, rows)  # no -0
     digits = 15 if rows[:, 3].abs().max() > 1e4 else 7  # rotations of map coordinates move them far

@@ -1,6 +1,5 @@
 """`padgs-run`: one run, or a multirun of many, composed by Hydra from `conf/`."""
 
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -57,8 +56,6 @@ def _answer(arguments: Sequence[str]) -> None:
     if {"--help", "-h"} & {*arguments}:
         print(manual(arguments))
         sys.exit()
-    if {"-sc", "--shell_completion"} & {*arguments}:
-        _complete()
     if error := problem(arguments) or missing_plugin(arguments) or clash():
         raise ValueError(error)
     if SHOW in arguments:
@@ -68,19 +65,6 @@ def _answer(arguments: Sequence[str]) -> None:
         with composing():
             print(composed_text(settings, key), end="")
         sys.exit()
-
-
-def _complete() -> None:
-    """Let Hydra complete a command line, and exit."""
-    import hydra
-
-    from padgs.multirun.composition import register_choices
-    from padgs.multirun.overrides import root
-
-    os.environ.setdefault("PADGS_ROOT", str(root()))
-    register_choices()
-    hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(lambda _: None)()
-    sys.exit()
 
 
 if __name__ == "__main__":

@@ -256,12 +256,7 @@ class Multirun:
 
 
 def status_line(before: Counter[str], states: Collection[JobState], seconds: float) -> str:
-    """Sum up a multirun in one line, from the statuses of runs finished before and the states of jobs.
-
-    >>> states = [JobState("ok"), JobState("nan"), JobState("running"), JobState()]
-    >>> status_line(Counter(ok=2), states, 60.0)
-    '3 of 6 done (2 before), 1 failed (nan), 1 running, 1 waiting, ETA 1:00'
-    """
+    """Sum up a multirun in one line, from the statuses of runs finished before and the states of jobs."""
     counts = before + Counter(state.status for state in states)
     total, done, earlier = counts.total(), counts.pop(Status.OK, 0), before[Status.OK]
     parts = [f"{done} of {total} done" + (f" ({earlier} before)" if earlier else "")]

@@ -125,11 +125,7 @@ def equal_times(run_set: RunSet) -> list[TradeOff]:
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the points (cost, quality, more is better) that no other point beats in both, by rising cost.
-
-    >>> pareto([(1, 20.0), (2, 19.0), (3, 25.0)])
-    [(1, 20.0), (3, 25.0)]
-    """
+    """Return the points (cost, quality, more is better) that no other point beats in both, by rising cost."""
     front: list[tuple[float, float]] = []
     for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):
         if not front or quality > front[-1][1]:

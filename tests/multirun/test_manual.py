@@ -1,7 +1,3 @@
-import os
-import subprocess
-import sys
-
 import pytest
 from typer.testing import CliRunner
 
@@ -33,11 +29,6 @@ def test_every_key_has_a_meaning(name):
 
 
 @pytest.mark.slow
-def test_both_programs_complete(root):
-    line = "padgs-run method=omn"
-    environment = os.environ | {"COMP_LINE": line, "COMP_POINT": str(len(line)), "PYTHONPATH": str(root)}
-    command = [sys.executable, "-W", "ignore", "-m", "padgs.multirun.run", "-sc", "query=bash"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.stdout.split() == ["method=omnigs", "method=omnigs_release"]
+def test_padgs_completes():
     asked = {"_PADGS_COMPLETE": "complete_bash", "COMP_WORDS": "padgs con", "COMP_CWORD": "1"}
     assert "convert" in CliRunner().invoke(app, [], env=asked, prog_name="padgs").output

@@ -139,12 +139,6 @@ def device_stages(work: Workload, rounds: int, device: torch.device) -> dict[str
 
 
 def kernel_name(signature: str) -> str:
-    """Return a kernel's name without return type, template arguments and parameters.
-
-    >>> kernel_name("void padgs::(anonymous namespace)::blend_kernel<16, true>(Arguments)")
-    'padgs::blend_kernel'
-    >>> kernel_name("Memcpy HtoD (Pinned -> Device)")
-    'Memcpy HtoD'
-    """
+    """Return a kernel's name without return type, template arguments and parameters."""
     name = signature.removeprefix("void ").replace("(anonymous namespace)::", "")
     return re.split(r"[<(]", name)[0].strip() or signature

@@ -102,12 +102,7 @@ def textureless(scene: Scene, share: float, random: np.random.Generator) -> Scen
 
 
 @condition(
-    "pixel values of each training view are multiplied or divided by up to 2^{}",
-    0.25,
-    0.5,
-    1.0,
-    metric="ws_psnr_fitted",
-    allowed=(0.5, 1.5, 3.0),
+    "training views are up to 2^{} brighter or darker", 0.25, 0.5, 1.0, metric="ws_psnr_fitted", allowed=(0.5, 1.5, 3.0)
 )
 def exposure(scene: Scene, doublings: float, random: np.random.Generator) -> Scene:
     """Multiply the stored values of each training view by 2^e, e uniform in [-doublings, doublings]; in sRGB that is

@@ -85,6 +85,8 @@ class SyntheticTruth:
     @cached_property
     def given_poses(self) -> Array:
         """Return the poses [n, 4, 4] of the scene in world units, with pose noise on training views."""
+        from scipy.spatial.transform import Rotation
+
         rng = self.random("pose noise")
         shift = self.options.pose_noise_translation * self.median_depth if self.options.pose_noise_translation else 0.0
         angle = np.radians(self.options.pose_noise_rotation)
@@ -93,7 +95,8 @@ class SyntheticTruth:
         for index in range(len(given)):
             offset, axis, size = rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal()
             if index not in held_out:
-                rotation = _rotation(axis / np.linalg.norm(axis) * angle * size) @ given[index, :3, :3]
+                turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle * size).as_matrix()
+                rotation = turn @ given[index, :3, :3]
                 position = camera.center(given[index]) + shift * offset
                 given[index, :3, :3], given[index, :3, 3] = rotation, -rotation @ position
         given[:, :3, 3] *= self.options.world_scale
@@ -108,13 +111,3 @@ class SyntheticTruth:
                 return self.poses[index]
         pose[:3, 3] /= self.options.world_scale
         return pose
-
-
-def _rotation(vector: Array) -> Array:
-    """Return the rotation [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

@@ -105,7 +105,7 @@ class AnchorModel:
             rendering, offsets = self._rendered(decoded, view)
         count = decoded.count()
         self._capacity = max(int(HEADROOM * count) + 1, self._capacity * 15 // 16)
-        drawn, gaussians = replace(rendering, visible=rendering.visible[:count]), decoded.gaussians.first(count)
+        drawn, gaussians = replace(rendering, visible=rendering.visible[:count]), decoded.gaussians.chosen(slice(count))
         return AnchorRender(drawn, offsets, gaussians, decoded.slots[:count], decoded.raw_opacities)
 
     def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:

@@ -131,10 +131,7 @@ class _DecodeOnGPU(torch.autograd.Function):
             decode_arguments(constants, raw, starts, slots, outputs),
             *map(pointer, upstream),
             ctx.features,
-            None,
-            pointer(grad_offsets),
-            pointer(grad_log_scales),
-            None,
+            *map(pointer, (None, grad_offsets, grad_log_scales, None)),
         )
         arguments = DeviceDecodeGradientArguments(gradient, len(slots), *map(pointer, grad_logits))
         cuda.call("padgs_cuda_decode_take_back", cuda.queue(raw.device), arguments)

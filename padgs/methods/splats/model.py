@@ -75,6 +75,8 @@ class SplatModel:
         self.pruning = PruningStep(self.densifier.options, requested=requested, prune_psnr=prune_psnr)
         variance = options.smoothing_filter
         self._filter = SmoothingFilter(variance, cameras_of(views)) if variance > 0 else None
+        parts: dict[str, Any] = {FILTER_VARIANCES: self._filter, LENGTHS: self._lengths}
+        self._measured = {name: part for name, part in parts.items() if part is not None}
         self._follow()
 
     def groups(self) -> list[ParameterGroup]:
@@ -163,8 +165,8 @@ class SplatModel:
 
     def _follow(self, unless: int | None = None) -> None:
         """Update filter and lengths, but not those that have as many rows as `unless`."""
-        for part in (self._filter, self._lengths):
-            if part is not None and len(part) != unless:
+        for part in self._measured.values():
+            if len(part) != unless:
                 part.update(self.splats.means)
 
     def _prune_invisible(self, smooth: SmoothingFilter, optimizer: torch.optim.Adam) -> tuple[str, ...]:
@@ -192,10 +194,8 @@ class SplatModel:
     def keep(self, rows: Tensor) -> None:
         keep_rows(self.splats.rows(), None, rows)
         self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
-        if self._filter is not None:
-            self._filter.variances = self._filter.variances[rows]
-        if self._lengths is not None:
-            self._lengths.values = self._lengths.values[rows]
+        for part in self._measured.values():
+            part.values = part.values[rows]
 
     def prune(self, count: int, views: Sequence[View]) -> None:
         self.keep(most_important(importance_scores(self, views), count))
@@ -211,7 +211,7 @@ class SplatModel:
 
     def baked(self) -> Splats:
         """Return splats with the smoothing filter applied, for programs that have no such filter."""
-        return self.splats if self._filter is None else widened(self.splats, self._filter.variances)
+        return self.splats if self._filter is None else widened(self.splats, self._filter.values)
 
     def size(self) -> Size:
         return Size.of(self.counts(), self.splats.parameters(), stored=self.splats.parameters())
@@ -221,10 +221,7 @@ class SplatModel:
         tensors = {f"splats/{name}": tensor for name, tensor in self.splats.state_dict().items()}
         tensors |= {f"statistics/{name}": tensor for name, tensor in self.densifier.statistics.items()}
         tensors["random/pieces"] = self.densifier.generator.get_state()
-        if self._filter is not None:
-            tensors[FILTER_VARIANCES] = self._filter.variances
-        if self._lengths is not None:
-            tensors[LENGTHS] = self._lengths.values
+        tensors |= {name: part.values for name, part in self._measured.items()}
         values = {
             "active_degree": self.splats.active_degree,
             "degree": self.splats.degree,
@@ -243,10 +240,8 @@ class SplatModel:
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
         self.pruning.done, self._step = state.values["pruned"], state.values["step"]
-        if self._filter is not None:
-            self._filter.variances = state.tensors[FILTER_VARIANCES].to(device, copy=True)
-        if self._lengths is not None:
-            self._lengths.values = state.tensors[LENGTHS].to(device, copy=True)
+        for name, part in self._measured.items():
+            part.values = state.tensors[name].to(device, copy=True)
 
     def load_model(self, state: State) -> None:
         """Load the parameters only, as those of a finished schedule until `adapt` says otherwise."""

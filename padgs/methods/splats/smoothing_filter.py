@@ -53,24 +53,24 @@ def smoothed_for_view(gaussians: Gaussians, view: View, pixels: Tensor, variance
 class SmoothingFilter:
     """3D filter as in SPaGS: adds a share of the finest training pixel to every Gaussian, in training and rendering.
 
-    The added `variances` [N], world units squared, have no derivative and follow the means whenever they are updated.
+    The added `values` [N], world units squared, have no derivative and follow the means whenever they are updated.
     """
 
     def __init__(self, square_pixels: float, cameras: Tensor) -> None:
         """Set the variance in square pixels of the cameras [V, 4] from `cameras_of`."""
         self.square_pixels, self.cameras = square_pixels, cameras
-        self.variances = torch.zeros(0)
+        self.values = torch.zeros(0)
 
     def __len__(self) -> int:
-        return len(self.variances)
+        return len(self.values)
 
     def update(self, means: Tensor) -> None:
         """Measure the finest pixel at each of the means [N, 3]."""
-        self.variances = self.square_pixels * finest_pixels(means.detach(), self.cameras).square()
+        self.values = self.square_pixels * finest_pixels(means.detach(), self.cameras).square()
 
     def __call__(self, gaussians: Gaussians) -> Gaussians:
         """Return widened Gaussians; opacity falls as the volume grows."""
-        wide, share = widened_scales(gaussians.scales, self.variances)
+        wide, share = widened_scales(gaussians.scales, self.values)
         return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
 
 

@@ -73,6 +73,14 @@ def test_hooked_calls_exist_and_belong_to_a_stage():
         assert hasattr(cpu.library(), name)
 
 
+def test_names_of_kernels_are_without_types_and_arguments():
+    blend = "void padgs::(anonymous namespace)::blend_kernel<16, true>(Arguments)"
+    assert [*map(stages.kernel_name, (blend, "Memcpy HtoD (Pinned -> Device)"))] == [
+        "padgs::blend_kernel",
+        "Memcpy HtoD",
+    ]
+
+
 def test_the_profiler_lists_kernels_of_an_iteration_slowest_first():
     found = stages.device_stages(build(Size(32, 16, 50)), 2, torch.device("cpu"))  # operators in place of kernels
     seconds = [entry["seconds"] for entry in found.values()]

@@ -1,6 +1,7 @@
 """`padgs export`: from a run to a file and back; transforms of Gaussians."""
 
 import math
+import re
 import shutil
 from dataclasses import replace
 
@@ -34,7 +35,14 @@ def export(*arguments: str):
 
 @pytest.fixture(scope="module")
 def splat_run(tmp_path_factory):
-    return tiny_run(tmp_path_factory, "method=padgs_plus")
+    """A run whose Gaussians are written as trained."""
+    return tiny_run(tmp_path_factory, "method=padgs_plus", "render.steepness=0")
+
+
+@pytest.fixture(scope="module")
+def steep_run(tmp_path_factory):
+    """A run whose response is no Gaussian."""
+    return tiny_run(tmp_path_factory, "method=padgs_plus", "data.generator.width=64", "train.iterations=60")
 
 
 def test_an_exported_run_scores_like_the_run(splat_run):
@@ -50,6 +58,24 @@ def test_an_exported_run_scores_like_the_run(splat_run):
     assert again.metrics["ws_psnr"] == pytest.approx(same.metrics["ws_psnr"], abs=1e-6)
     assert again.metrics["ws_psnr"] == pytest.approx(own.metrics["ws_psnr"], abs=0.05)  # a file knows no cameras
     (splat_run / "splats.ply").unlink()
+
+
+def test_a_steeper_response_is_exported_as_gaussians_of_equal_area_and_fitted(steep_run, tmp_path):
+    run = padgs.load_run(steep_run, device="cpu")
+    s, own = run.config.render.steepness, run.method.model.splats
+    plain, fitted = (export_run(run, distillation_steps=steps) for steps in (0, 40))
+    q = torch.linspace(0, 60, 600_001, dtype=torch.float64)
+    area = torch.trapezoid(torch.exp(-0.5 * (q * (1 - s) + s * q * q)), q) / 2  # 1 for a Gaussian
+    assert s == 0.25 and area.item() == pytest.approx(0.7526, abs=1e-4)
+    moved = plain.splats.log_scales - own.log_scales
+    torch.testing.assert_close(moved, (0.5 * area.log()).float().expand_as(moved), rtol=1e-4, atol=1e-6)
+    assert torch.equal(plain.splats.means, own.means) and not torch.equal(fitted.splats.means, own.means)
+    found = [float(re.search(r"views ([\d.]+) dB", " ".join(found.notes))[1]) for found in (plain, fitted)]
+    assert found[1] > found[0] + 0.1, "renders of the run are fitted"
+    assert "Gaussians for a response of steepness 0.25; WS-PSNR of the test views" in " ".join(fitted.notes)
+    assert "changes nothing" not in " ".join(plain.notes)
+    gone = export(str(steep_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
+    assert gone.exit_code == 0 and "Gaussians of equal area" in gone.output
 
 
 def test_gaussians_are_exported_without_the_data_set(splat_run, tmp_path):
@@ -115,7 +141,7 @@ def test_a_box_is_cropped(splat_run, tmp_path):
 
 def test_an_empty_box_is_found_before_the_long_work(tmp_path_factory, monkeypatch):
     run = padgs.load_run(tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=2"))
-    monkeypatch.setattr(explicit, "_bake_and_distill", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(explicit, "bake", lambda *_: pytest.fail("baked"))
     with pytest.raises(ValueError, match="no Gaussian lies in the box"):
         explicit.export_run(run, crop=(800, 0, 0, 900, 1, 1))
 

@@ -206,7 +206,7 @@ def test_faces_of_a_cubemap_share_a_capacity_for_the_largest(generator, monkeypa
         bins = recorded(monkeypatch, "padgs_cuda_bin", lambda arguments: arguments.sort.count)
         drawn(many, (72, 36), options)
         for _ in range(5):
-            drawn(many.first(10), (72, 36), options)
+            drawn(many.chosen(slice(10)), (72, 36), options)
     assert len(bins) == 6, "no face is drawn twice"
 
 

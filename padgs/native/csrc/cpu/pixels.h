@@ -15,6 +15,7 @@ namespace padgs {
 namespace PADGS_ISA {
 
 const float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
+const float kLeastLog2Alpha = -64;  // bounds what is far away, whose exponential would be denormal, which is slow
 const float kHalfLog2 = 0.72134752044448170f;  // log2(e) / 2
 
 // Rows of 16 floats for each row of patches: where its lanes are.
@@ -59,7 +60,7 @@ struct PlanarFootprint {
     At at;
     const Vec dv = place.y - v, t = du * a + dv * b, cross = dv * c;
     at.factors = {t, dv};
-    at.log2_alpha = (log2_opacity - cross * cross) - t * t;
+    at.log2_alpha = maximum((log2_opacity - cross * cross) - t * t, splat(kLeastLog2Alpha));
     at.reached = at_least(at.log2_alpha, splat(kLog2AlphaMin));
     return at;
   }
@@ -134,7 +135,8 @@ struct ProjectiveFootprint {
     At at;
     at.b_by_d = b * inverse;
     at.factors = {n * inverse, x * at.b_by_d, y * at.b_by_d};
-    at.log2_alpha = f.log2_opacity - at.factors.q * ((1 - steepness) + at.factors.q * steepness) * kHalfLog2;
+    const Vec exponent = at.factors.q * ((1 - steepness) + at.factors.q * steepness) * kHalfLog2;
+    at.log2_alpha = maximum(f.log2_opacity - exponent, splat(kLeastLog2Alpha));
     at.reached = both(at_least(at.log2_alpha, splat(kLog2AlphaMin)), both(less(zero(), b), less(d * s[10], b)));
     return at;
   }
