@@ -176,6 +176,7 @@ class Multirun:
             if state.status == Status.ELSEWHERE and (result := self._result(state.run)):  # done by the other process
                 self.states[index] = replace(state, status=result.status)  # looked up again: it may lack scores
                 self._rows.append((self._titles[index], state.run))
+                self._tracker.add(self.runs / state.run)
         self._say(self.line())
         self._show_table()
         counts = self.counts()
