@@ -209,7 +209,7 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
         runs = runs.loc[[place.outdoor is (claim.scenes == "outdoor") for place in runs["place"]]]
     ours, others = claim.sides
     timed = runs.reindex(columns=[f"{CONFIG}budget.seconds"]).notna().any(axis=1)
-    # Costs depend on the machine, and so does what a run of a minute becomes
+    # Costs depend on the machine, and so does the quality after a minute.
     runs = runs.assign(apart=runs["machine"].where(timed | (claim.metric in COSTS), ""))
     shared = ("place", "resolution", "length", "data", "apart")
     best: dict[tuple[str, ...], dict[str, Any]] = {}

@@ -70,9 +70,8 @@ def report(
             texts = {}
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
-        is_table = not REPORTS[name].function.endswith(
-            ("charts", ":html")
-        )  # the user may have a chart.csv or gallery.md
+        # Of tables only: the user may have a chart.csv or gallery.md.
+        is_table = not REPORTS[name].function.endswith(("charts", ":html"))
         with name_place(target, "--out"):
             for ending in ("md", "tex", "csv") if is_table and f"{name}.md" not in texts else ():
                 (target / f"{name}.{ending}").unlink(missing_ok=True)  # an old table must not lie beside new ones

@@ -26,8 +26,6 @@ from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")
-
-
 DEVICES = ("auto", "cpu", "cuda")
 
 

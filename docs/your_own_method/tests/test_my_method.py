@@ -1,4 +1,4 @@
-"""What every method of padgs promises. Copy this to your tests and change NAME; `pytest` must pass."""
+"""Promises of every method of padgs. Copy this to your tests and change NAME; `pytest` must pass."""
 
 import pytest
 import torch

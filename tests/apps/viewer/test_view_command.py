@@ -48,7 +48,7 @@ def test_the_next_command_is_named_at_its_end_and_after_no_error(tmp_path, monke
 
 
 def test_no_run_is_opened_before_all_have_a_checkpoint(tmp_path, monkeypatch):
-    """What is opened while another one is waited for is old by then."""
+    """Wait for all runs first: one opened before would be old by then."""
     done = []
     scene = SimpleNamespace(name="room")
     opened = lambda path, *_: done.append(("open", path)) or SimpleNamespace(notes=(), scene=scene)  # noqa: E731

@@ -1,4 +1,4 @@
-"""What a preparation asks of its input and of the machine before it works."""
+"""Checks of input and machine before `prepare` works."""
 
 from pathlib import Path
 

@@ -72,7 +72,7 @@ def of_paper() -> str:
 
 
 def about(html: str, section: str) -> list[str]:
-    """What the parts of a section say that they are about."""
+    """Return the subjects (`data-of`) of the parts of a section."""
     return re.findall(r'data-of="([^"]*)"', html.partition(f'<section id="{section}"')[2].partition("</section>")[0])
 
 
