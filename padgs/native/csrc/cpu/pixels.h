@@ -149,18 +149,18 @@ struct ProjectiveFootprint {
     e.z = at.cx * s[2] + at.cy * s[5] - at.q * s[8];
     return e;
   }
-  // f'(q)
-  PADGS_ALWAYS_INLINE static Vec growth(float steepness, Vec q) { return (1 - steepness) + q * (2 * steepness); }
+  // f'(q).
+  PADGS_ALWAYS_INLINE static Vec derivative(float steepness, Vec q) { return (1 - steepness) + q * (2 * steepness); }
   // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/df.
   PADGS_ALWAYS_INLINE void add_ray_gradient(const Factors &at, Vec b_by_d, Vec m, Place &grad) const {
-    const Vec scale = -(m * growth(steepness, at.q) * b_by_d);
+    const Vec scale = -(m * derivative(steepness, at.q) * b_by_d);
     const Place e = slope(at);
     grad.x += scale * e.x, grad.y += scale * e.y, grad.z += scale * e.z;
   }
   // |dL/dmean| of each pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
   PADGS_ALWAYS_INLINE Vec absgrad(const Factors &at, Vec m) const {
     const Place e = slope(at);
-    return magnitude(m) * growth(steepness, at.q) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
+    return magnitude(m) * derivative(steepness, at.q) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
   }
 
   struct GradientSums {
@@ -170,7 +170,7 @@ struct ProjectiveFootprint {
     explicit GradientSums(const ProjectiveFootprint &seen) : steepness(seen.steepness) {}
     PADGS_ALWAYS_INLINE void add(const Factors &at, Vec weight) {
       m += weight;
-      weight = weight * growth(steepness, at.q);
+      weight = weight * derivative(steepness, at.q);
       const Vec w0 = weight * at.q, w1 = weight * at.cx, w2 = weight * at.cy;
       c0 += w0, c1 += w1, c2 += w2;
       c00 += w0 * at.q, c01 += w0 * at.cx, c02 += w0 * at.cy;

@@ -64,7 +64,8 @@ struct PixelOf<false> {
 // A pixel outside the image, which draws nothing, is taken for the first.
 template <class Pixel>
 __device__ Pixel pixel_at(const BlendInputs &args, const PixelPlace &place) {
-  return {args.rays, args.steepness, args.wrap, args.table.width, place.inside ? place.x : 0, place.inside ? place.y : 0};
+  const int x = place.inside ? place.x : 0, y = place.inside ? place.y : 0;
+  return {args.rays, args.steepness, args.wrap, args.table.width, x, y};
 }
 
 // Hybrid blending, hybrid.cu and hybrid_backward.cu: as padgs_cuda_blend, and all but the sum over slots.

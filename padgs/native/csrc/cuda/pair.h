@@ -30,7 +30,7 @@ struct ProjectivePair {
   static constexpr int kGradientSums = 10;
   float q, cx, cy, log2_alpha;
   float b_by_d;
-  float growth;  // f'(q) of the exponent -f(q) / 2, f(q) = (1 - s) q + s q^2 with the steepness s
+  float derivative;  // f'(q) of the exponent -f(q) / 2, f(q) = (1 - s) q + s q^2 with the steepness s
   bool reached;
 
   // Where the Gaussian lies on the ray: for projection `ray` at its largest value there, |M^-1 mean| b / D; else at its
@@ -47,12 +47,12 @@ struct ProjectivePair {
   // |dL/dmean| of one pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
   __device__ float absgrad(const Footprint &f, float m) const {
     const Vec3<float> e = slope(f);
-    return magnitude(m) * growth * root(dot(e, e) * f.shape[9]);
+    return magnitude(m) * derivative * root(dot(e, e) * f.shape[9]);
   }
 
   // M times 1, and times f'(q), c and c c^T with c = (q, c_x, c_y); see projective.h.
   __device__ void gradient_sums(float m, float *out) const {
-    const float w0 = m * growth * q, w1 = m * growth * cx, w2 = m * growth * cy;
+    const float w0 = m * derivative * q, w1 = m * derivative * cx, w2 = m * derivative * cy;
     out[0] = m, out[1] = w0, out[2] = w1, out[3] = w2;
     out[4] = w0 * q, out[5] = w0 * cx, out[6] = w0 * cy;
     out[7] = w1 * cx, out[8] = w1 * cy, out[9] = w2 * cy;
@@ -107,7 +107,7 @@ struct ProjectivePixel {
     p.b_by_d = b * inverse;
     p.cx = x * p.b_by_d;
     p.cy = y * p.b_by_d;
-    p.growth = fmaf(2 * steepness, p.q, 1 - steepness);
+    p.derivative = fmaf(2 * steepness, p.q, 1 - steepness);
     p.log2_alpha = fmaf(-p.q * fmaf(steepness, p.q, 1 - steepness), kHalfLog2E, f.log2_opacity);
     p.reached = p.log2_alpha >= kLog2AlphaMin && b > 0 && b > d * s[10];
     return p;
@@ -115,7 +115,7 @@ struct ProjectivePixel {
 
   // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/df.
   __device__ Vec3<float> ray_gradient(const Footprint &f, const ProjectivePair &p, float m) const {
-    return scaled(-(m * p.growth * p.b_by_d), p.slope(f));
+    return scaled(-(m * p.derivative * p.b_by_d), p.slope(f));
   }
 };
 
