@@ -56,7 +56,7 @@ def load(
         options: the `data` group of the configuration.
         fields: single options by name; they override `options`.
     """
-    options = replace(options, **fields)  # type: ignore[arg-type]
+    options = replace(options, **fields)
     if path is None and options.dataset is not None:
         scene = lookup_dataset(options.dataset).scenes[0]
         raise DataError(

@@ -166,7 +166,7 @@ def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene |
     mask, split, points, depth = {"mask": "none"}, {"split": "all"}, {"points": "random"}, {"depth": "none"}
     for change in ({}, mask, split, points, depth, mask | split, mask | split | points | depth):
         try:
-            return assemble(capture, replace(options, **change))  # type: ignore[arg-type]
+            return assemble(capture, replace(options, **change))
         except DataError as error:
             if str(error) not in report.problems:
                 report.problems.append(str(error))

@@ -172,7 +172,7 @@ class Search:
     def _trained(self, config: RunConfig, stop_requested: Callable[[], bool]) -> Result:
         start(config)
         callback = Callback()
-        callback.stop_requested = stop_requested  # type: ignore[method-assign]
+        callback.stop_requested = stop_requested
         callback.is_candidate = True
         result = run(config, Console(quiet=True), callback, self.run.scene)
         if not result.ok:
