@@ -28,6 +28,13 @@ def ctrl_c() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def shared_by_workers(tmp_path_factory) -> None:
+    """Name a folder of all processes of this test run."""
+    base = tmp_path_factory.getbasetemp()
+    os.environ["PADGS_TESTS_SHARED"] = str(base.parent if "PYTEST_XDIST_WORKER" in os.environ else base)
+
+
 @pytest.fixture(autouse=True)
 def signals() -> Iterator[None]:
     """Handlers of signals, and what is known of received ones, are those of before after each test."""

@@ -2,6 +2,7 @@
 inside functions count too."""
 
 import ast
+import functools
 import re
 import statistics
 import subprocess
@@ -61,6 +62,7 @@ def package_of(module: str) -> str:
     return "core" if is_core else second
 
 
+@functools.cache
 def imports(source: str) -> list[tuple[str, bool]]:
     """Imported names, and whether they are imported together with the module (not inside a function)."""
     tree = ast.parse(source)

@@ -282,6 +282,5 @@ def _joined(runs: Sequence[LoadedRun], numbers: Sequence[int], regions: Mapping[
         tensors["cameras"] = cameras_of(scene.train)
     values = model.values | {"scene_scale": scene.scale, "extent": scene.extent}
     values["active_degree"] = max(run.method.model.splats.active_degree for run in runs)
-    values["supersampling"] = max(run.method.model.supersampling for run in runs)
     others = {name: tensor for name, tensor in stored.tensors.items() if name.startswith("random/")}
     return State({f"{MODEL}{n}": t for n, t in tensors.items()} | others, stored.values | {"model": values})

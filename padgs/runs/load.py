@@ -24,7 +24,6 @@ from padgs.data.capture import DataError
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.evaluation.scoring import score
 from padgs.geometry.camera import Camera, Panorama, Pinhole
-from padgs.methods.splats.model import SplatModel
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
 from padgs.runs.config import DEVICES, RunConfig, choose_device, config_from_values
@@ -145,10 +144,8 @@ class LoadedRun:
         finer = max(1.0, camera.focal / trained.focal)
         if not isinstance(camera, Panorama):
             finer /= self.method.CUT_FINENESS
-        model = self.method.model
-        times = model.supersampling if isinstance(model, SplatModel) else settings.supersampling
-        samples = math.ceil(times / max(1.0, finer) - 1e-6)
-        finer *= samples / times
+        samples = math.ceil(settings.supersampling / max(1.0, finer) - 1e-6)
+        finer *= samples / settings.supersampling
         settings = replace(settings, supersampling=samples)
         if not self.method.has_smoothing_filter:
             settings = replace(settings, low_pass=settings.low_pass * finer**2)

@@ -1,5 +1,6 @@
 """Hybrid blending: its weights, and values, derivatives and order in every backend and projection."""
 
+import functools
 import math
 from dataclasses import replace
 
@@ -98,13 +99,26 @@ def test_images_match_the_published_procedure(projection: str, size: int, backen
     assert abs(rendering.counters["contributing"] - contributing) <= int((alpha[~stable] > 0).sum())
 
 
-def assert_native_matches(gaussians: Gaussians, camera: Camera, options: RenderOptions, generator, backend: str):
+def defined(gaussians: Gaussians, camera: Camera, options: RenderOptions, generator: torch.Generator) -> tuple:
+    """Return Gaussians, camera, options, stable pixels and the definition of a case."""
     *_, stable = fragments(gaussians, camera, options, cases.identity_pose())
     stable = stable.view(camera.height, camera.width)
     assert stable.double().mean() > 0.6
-    cases.assert_matches_definition(
-        gaussians, camera, options, stable, generator, backend=backend, depth_tolerance=1e-4
-    )
+    arguments = (gaussians, camera, options, stable)
+    return *arguments, cases.definition(*arguments, generator)
+
+
+@functools.cache  # for all engines
+def cases_of(projection: str, kind: str, size: int) -> list[tuple]:
+    """Return what `defined` returns for two image sizes."""
+    generator = torch.Generator().manual_seed(7 + size)
+    gaussians = cases.gaussians_of("huge" if kind == "broad" else kind, 25, generator)
+    gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
+    if kind == "broad":  # but with the camera outside, and seen through
+        gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
+    options = options_of(projection, size, **STEEP.get(projection, {}))
+    cameras = [camera_of(projection, width, height) for width, height in ((70, 44), (33, 17))]
+    return [defined(gaussians, camera, options, generator) for camera in cameras]
 
 
 @cases.each_native_engine
@@ -117,16 +131,8 @@ def assert_native_matches(gaussians: Gaussians, camera: Camera, options: RenderO
     ],
 )
 def test_native_matches_the_definition(projection: str, kind: str, size: int, backend: str):
-    generator = torch.Generator().manual_seed(7 + size)
-    gaussians = cases.gaussians_of("huge" if kind == "broad" else kind, 25, generator)
-    gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
-    if kind == "broad":  # but with the camera outside, and seen through
-        gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
-    for width, height in ((70, 44), (33, 17)):
-        camera = camera_of(projection, width, height)
-        assert_native_matches(
-            gaussians, camera, options_of(projection, size, **STEEP.get(projection, {})), generator, backend
-        )
+    for case in cases_of(projection, kind, size):
+        cases.assert_matches_definition(*case, backend=backend, depth_tolerance=1e-4)
 
 
 @cases.each_native_engine
@@ -141,7 +147,8 @@ def test_native_matches_the_definition_for_other_cameras(projection: str, case: 
         camera, gaussians = Panorama(330, 165), cases.mixture(8, generator, ("polar", "pole", "seam"))
     else:
         camera, gaussians = render_cases.camera_of(case, 72, 36), cases.gaussians_of("ordinary", 60, generator)
-    assert_native_matches(gaussians, camera, options_of(projection, 3), generator, backend)
+    case = defined(gaussians, camera, options_of(projection, 3), generator)
+    cases.assert_matches_definition(*case, backend=backend, depth_tolerance=1e-4)
 
 
 def overlapping(count: int, generator: torch.Generator) -> Gaussians:

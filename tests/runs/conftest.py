@@ -1,5 +1,7 @@
 """A configuration of a run on the tiny scene, for tests of what a run does."""
 
+from dataclasses import replace
+
 import pytest
 from support.composed import composed
 from support.tiny_scene import tiny_scene
@@ -16,10 +18,5 @@ def tiny(monkeypatch, root):
 
 @pytest.fixture
 def config(tmp_path, tiny):
-    return composed(
-        *SMALL,
-        f"run.folder={tmp_path}/runs",
-        f"train.iterations={ITERATIONS}",
-        "run.log_every=2",
-        "run.probe_every=5",
-    )
+    config = composed(*SMALL, f"train.iterations={ITERATIONS}", "run.log_every=2", "run.probe_every=5")
+    return replace(config, run=replace(config.run, folder=f"{tmp_path}/runs"))

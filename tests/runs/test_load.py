@@ -105,15 +105,6 @@ def test_finer_pixels_have_fewer_samples_as_close_together(tmp_path_factory):
     torch.testing.assert_close(run.method.render(view).image, mean, atol=1e-5, rtol=0)
 
 
-def test_low_passes_keep_their_angle_where_a_short_run_had_one_sample(tmp_path_factory):
-    overrides = ["method=padgs_plus", "method.supersampling_share=1000.0"]
-    overrides += ["render.low_pass_kind=angular"]  # which the 3D filter does not replace
-    run = padgs.load_run(tiny_run(tmp_path_factory, *overrides), device="cpu")
-    assert (run.config.render.supersampling, run.method.model.supersampling) == (2, 1)
-    finer = run.through(Panorama(4 * run.scene.train[0].width, 4 * run.scene.train[0].height))
-    assert finer.render_config.low_pass == pytest.approx(16 * run.config.render.low_pass)
-
-
 def test_a_run_of_a_gpu_opens_without_one(folder, tmp_path, monkeypatch):
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)

@@ -3,18 +3,18 @@
 Importing this module arranges it for the whole process. On a GPU, tensors of a test stay on the CPU and take a trip.
 """
 
-import atexit
 import ctypes
 import functools
+import hashlib
 import os
 import shutil
 import subprocess
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import RayTable
@@ -54,7 +54,7 @@ def fused_library() -> ctypes.CDLL:
 
 
 def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
-    """Compile C++ or CUDA sources to a shared library for the lifetime of this process."""
+    """Compile C++ or CUDA sources to a shared library, once for all processes of a test run."""
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
     flags += ["-Wno-unknown-pragmas"]  # nvcc's
     flags += ["-fno-gnu-unique"]  # or the emulations of two libraries would be one
@@ -63,11 +63,14 @@ def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
 
 
 def _loaded(name: str, command: list[str]) -> ctypes.CDLL:
-    folder = Path(tempfile.mkdtemp(prefix="padgs-emulated-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    target = folder / f"lib{name}.so"
-    done = subprocess.run([*command, "-o", str(target)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    digest = hashlib.sha256("\0".join(command).encode()).hexdigest()[:12]
+    target = Path(os.environ["PADGS_TESTS_SHARED"], f"lib{name}-{digest}.so")
+    with FileLock(f"{target}.lock"):
+        if not target.exists():
+            draft = target.with_suffix(".draft")
+            done = subprocess.run([*command, "-o", str(draft)], capture_output=True, text=True)
+            assert done.returncode == 0, done.stderr
+            draft.rename(target)
     return ctypes.CDLL(str(target))
 
 

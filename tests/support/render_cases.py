@@ -264,12 +264,26 @@ def differentiated(
     return rendering, gradients
 
 
-def assert_matches_definition(
+def definition(
     gaussians: Gaussians,
     camera: Camera,
     options: RenderOptions,
     stable: Tensor,
     generator: torch.Generator,
+    pose: Tensor | None = None,
+) -> tuple[Tensor, Rendering, dict[str, Tensor]]:
+    """Return random weights [H, W, 5] of stable pixels, and what `differentiated` returns for the definition."""
+    weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
+    drawn = differentiated(gaussians, camera, options, weights, pose=pose, backend="torch", dtype=torch.float64)
+    return weights, *drawn
+
+
+def assert_matches_definition(
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RenderOptions,
+    stable: Tensor,
+    defined: tuple[Tensor, Rendering, dict[str, Tensor]],
     *,
     backend: str,
     dtype: torch.dtype = torch.float32,
@@ -277,11 +291,9 @@ def assert_matches_definition(
     slack: float = 1,
     depth_tolerance: float = 1e-5,
 ) -> None:
-    """Compare values and gradients by every input with backend torch in float64 on stable pixels [H, W]."""
-    weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
-    arguments = (gaussians, camera, options, weights)
-    expected, expected_gradients = differentiated(*arguments, pose=pose, backend="torch", dtype=torch.float64)
-    actual, gradients = differentiated(*arguments, pose=pose, backend=backend, dtype=dtype)
+    """Compare values and gradients by every input with the `definition` on stable pixels [H, W]."""
+    weights, expected, expected_gradients = defined
+    actual, gradients = differentiated(gaussians, camera, options, weights, pose=pose, backend=backend, dtype=dtype)
     if options.projection in ("erp", "pinhole"):
         assert torch.equal(actual.visible, expected.visible)
     else:  # the definition has no bounds: visible Gaussians may lie outside the image

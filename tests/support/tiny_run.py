@@ -1,5 +1,6 @@
 """A finished run, small enough to be made in a second or two: 3 training and 2 test views of 32x16 of the room."""
 
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -23,15 +24,20 @@ SETTINGS = [
 ]
 
 
+_made: dict[tuple[str, ...], Path] = {}
+
+
 def tiny_run(factory: pytest.TempPathFactory, *settings: str) -> Path:
-    """The folder of a run of `method=omnigs`, or of what the settings say."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PADGS_CACHE", str(factory.getbasetemp() / "scenes"))
-        runs = factory.mktemp("runs")
-        with composing():
-            config = configuration(["method=omnigs", *SETTINGS, *settings, f"run.folder={runs}"])
-        run(config, Console(quiet=True))
-    return next(path.parent for path in runs.glob("*/result.json"))
+    """A folder of its own of a run of `method=omnigs`, or of what the settings say, which a process trains once."""
+    if settings not in _made:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("PADGS_CACHE", str(factory.getbasetemp() / "scenes"))
+            runs = factory.mktemp("runs")
+            with composing():
+                config = configuration(["method=omnigs", *SETTINGS, *settings, f"run.folder={runs}"])
+            run(config, Console(quiet=True))
+        _made[settings] = next(path.parent for path in runs.glob("*/result.json"))
+    return Path(shutil.copytree(_made[settings], factory.mktemp("runs") / _made[settings].name))
 
 
 SMALLEST = [  # for `padgs-run` as a process

@@ -1,5 +1,6 @@
 """A scene small enough to train on in a second: eight coloured Gaussians seen by six cameras."""
 
+import functools
 from dataclasses import replace
 
 import torch
@@ -43,15 +44,22 @@ def squared_error(method, view: View) -> float:
     return (method.render(view).image.clamp(0, 1) - view.image()).square().mean().item()
 
 
-def tiny_scene() -> Scene:
-    views = []
+@functools.cache
+def _pictures() -> list[tuple[Tensor, Tensor]]:
+    """Return pose and pixels of each view."""
+    found = []
     for number in range(6):
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = 0.3 * torch.tensor([number % 2, (number // 2) % 2, number / 3], dtype=torch.float64)
-        view = View(f"{number:02d}", pose, WIDTH, HEIGHT)
-        image = render(truth(), view, RenderOptions(), backend="torch").image
-        pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
-        views.append(View(view.name, pose, WIDTH, HEIGHT, load_pixels=lambda pixels=pixels: pixels))
+        image = render(truth(), View("", pose, WIDTH, HEIGHT), RenderOptions(), backend="torch").image
+        found.append((pose, (image.clamp(0, 1) * 255).round().to(torch.uint8)))
+    return found
+
+
+def tiny_scene() -> Scene:
+    views = []
+    for number, (pose, pixels) in enumerate(_pictures()):
+        views.append(View(f"{number:02d}", pose.clone(), WIDTH, HEIGHT, load_pixels=pixels.clone))
     noise = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
     points = truth().means.repeat(5, 1) + noise
     grey = torch.full((40, 3), 128, dtype=torch.uint8)

@@ -87,8 +87,7 @@ def export_run(
         splats = deepcopy(splats)
         splats.load({name: rows[inside] for name, rows in splats.rows().items()})
     kind = f"a low-pass of {config.low_pass:g} in {config.resolved_low_pass_kind}"
-    samples = model.supersampling if isinstance(model, SplatModel) else config.supersampling
-    kind += f" and {samples**2} samples a pixel" if samples > 1 else ""
+    kind += f" and {config.supersampling**2} samples a pixel" if config.supersampling > 1 else ""
     notes.append(f"trained with projection {config.projection}, {kind}; those of viewers differ")
     notes.append(AXES)
     try:

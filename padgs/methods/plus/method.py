@@ -57,8 +57,6 @@ class PlusOptions(SplatOptions):
     initial_scale: float = 0.6
     limit_per_pixel: float | None = 2.6
     supersampling_from: float = 0.7
-    supersampling_iterations: int = 1200  # shorter runs have one sample a pixel but for `supersampling_share`
-    supersampling_share: float = 0.25  # a shorter run has several if they change its views by this share of the error
     length_unit: str = NEAREST_CAMERA
     means_rate_factor: float = 2.0
     means_least_pace: float = 5.0  # that of runs of 1200 iterations
@@ -72,7 +70,6 @@ class PlusOptions(SplatOptions):
         thresholds = ("threshold_pixel_exponent", "threshold_full_views")
         off = "at least 0, which switches it off"
         check(self, off, lambda value: 0 <= value < math.inf, "smoothness_weight", *thresholds)
-        check(self, "at least 0", lambda least: least >= 0, "supersampling_iterations", "supersampling_share")
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "dropout")
         for field in fields(DensificationOptions):

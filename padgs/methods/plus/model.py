@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +17,7 @@ from padgs.methods.splats.smoothing_filter import cameras_of, finest_pixels, smo
 from padgs.methods.splats.splats import TINY, Splats
 from padgs.render import RenderConfig
 from padgs.scene import View
-from padgs.training.loss import squared_error
 from padgs.training.model import State, TrainingRender
-from padgs.training.targets import even_weight, image_of
 
 if TYPE_CHECKING:
     from padgs.methods.plus.method import PlusOptions
@@ -28,7 +25,6 @@ if TYPE_CHECKING:
 DEGREE_SHARE = 0.1  # of the run, between two SH degrees
 DROPOUT_UNTIL = 0.9  # share of the run after which no Gaussians are dropped
 SMOOTH_UP_TO = 4.0  # scene scales; surfaces farther away are smoothed less
-COMPARED_VIEWS = 4  # at most, drawn with one sample a pixel and with several
 CAMERAS = "cameras"  # key of the training cameras in a state
 
 
@@ -39,35 +35,12 @@ class PlusModel(SplatModel):
         views = kwargs.get("views", ())
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
         count = round(sum(view.sphere_share for view in views))
-        is_short = kwargs["iterations"] < options.supersampling_iterations
-        own = replace(config, supersampling=1) if is_short else config
-        super().__init__(splats, options.for_views(largest, count), own, **kwargs)
-        self.options, self._long_config = options, config
+        super().__init__(splats, options.for_views(largest, count), config, **kwargs)
+        self.options = options
         self._smoothness = options.smoothness(count)
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
         self._finest: tuple[Tensor, Tensor] | None = None  # means, and the finest training pixel at each
-
-    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        before, begin = self._step, max(1.0, self.options.supersampling_from * self.iterations)
-        events, several = super().adapt(iteration, optimizer), self._long_config.supersampling
-        if several > self.supersampling and before < begin <= iteration and self._gains_by_supersampling():
-            self._config = self._long_config
-            events += (f"{several}x{several} samples a pixel",)
-        return events
-
-    @torch.no_grad()
-    def _gains_by_supersampling(self) -> bool:
-        """Return whether it changes training views by at least `supersampling_share` of their squared error."""
-        change, error = 0.0, 0.0
-        for view in self._views[:: math.ceil(len(self._views) / COMPARED_VIEWS)]:
-            gaussians, scale = self.splats.gaussians(view), self.splats.scene_scale
-            one = self._rendered(gaussians, view, self._config.options(scale)).image
-            several = self._rendered(gaussians, view, self._long_config.options(scale)).image
-            target, weight = image_of(view, one.device), even_weight(view, one.device)
-            change += view.weight * squared_error(several, one, weight).item()
-            error += view.weight * squared_error(target, one, weight).item()
-        return change >= self.options.supersampling_share * error
 
     def degree_at(self, iteration: int) -> int:
         """Return the scheduled SH degree: one more after each `DEGREE_SHARE` of the run."""
@@ -122,12 +95,6 @@ class PlusModel(SplatModel):
     def state(self) -> State:
         state = super().state()
         return State(state.tensors | {CAMERAS: self._cameras}, state.values)
-
-    def load_model(self, state: State) -> None:
-        """Load the parameters as `SplatModel` does; a model of several samples a pixel keeps them in a short run."""
-        super().load_model(state)
-        if state.values["supersampling"] > 1:
-            self._config = self._long_config
 
     def load_state(self, state: State) -> None:
         super().load_state(state)

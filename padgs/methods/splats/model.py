@@ -230,7 +230,6 @@ class SplatModel:
             "iterations": self.iterations,
             "pruned": self.pruning.done,
             "step": self._step,
-            "supersampling": self.supersampling,
         }
         return State(tensors, values)
 
@@ -269,11 +268,6 @@ class SplatModel:
         """Samples along each side of a pixel at this step of the schedule."""
         begins = self.options.supersampling_from * self.iterations
         return 1 if self._step < begins else self._config.supersampling
-
-    @property
-    def supersampling(self) -> int:
-        """Samples along each side of a pixel in renders of the finished model."""
-        return self._config.supersampling
 
     def render_options(self, view: View) -> RenderOptions:
         """Return the renderer options for a view."""

@@ -1,5 +1,7 @@
 """Values and gradients of all backends against the definition in float64."""
 
+import functools
+
 import pytest
 import torch
 from support import render_cases as cases
@@ -28,16 +30,21 @@ ENGINES_IN_FLOAT32 = [engine for engine in cases.engines() if torch.float32 in e
 
 
 def assert_same(gaussians: Gaussians, size, lens, options, generator, **engine) -> None:
-    stable = cases.stable_pixels(gaussians, *size, lens=lens, pose=engine["pose"], options=options)
+    case = defined(gaussians, size, lens, options, generator, engine["pose"])
+    cases.assert_matches_definition(*case, **engine)
+
+
+def defined(gaussians: Gaussians, size, lens, options, generator, pose) -> tuple:
+    """Return Gaussians, camera, options, stable pixels and the definition of a case."""
+    stable = cases.stable_pixels(gaussians, *size, lens=lens, pose=pose, options=options)
     assert stable.double().mean() > 0.85
-    cases.assert_matches_definition(gaussians, cases.camera_of(lens, *size), options, stable, generator, **engine)
+    arguments = (gaussians, cases.camera_of(lens, *size), options, stable)
+    return *arguments, cases.definition(*arguments, generator, pose)
 
 
-@pytest.mark.parametrize(
-    ("projection", "lens", "configuration", "kind"), COMBINATIONS, ids=["-".join(c) for c in COMBINATIONS]
-)
-@pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
-def test_every_engine_agrees_with_the_definition(projection, lens, configuration, kind, backend, dtype):
+@functools.cache  # for all engines
+def case_of(projection, lens, configuration, kind) -> tuple:
+    """Return the pose of a case, and what `defined` returns."""
     generator = torch.Generator().manual_seed(cases.KINDS.index(kind))
     options = RenderOptions(projection, **CONFIGURATIONS[configuration])
     size = cases.ODD_SIZES[cases.KINDS.index(kind) % len(cases.ODD_SIZES)]
@@ -52,8 +59,17 @@ def test_every_engine_agrees_with_the_definition(projection, lens, configuration
         gaussians = Gaussians(**{**vars(gaussians), "scales": 0.2 * gaussians.scales})
     if kind == "needle" and projection == "ray":  # which fades what is thinner than a pixel
         gaussians = Gaussians(**{**vars(gaussians), "scales": gaussians.scales.clamp(min=0.03)})
+    return pose, *defined(gaussians, size, lens, options, generator, pose)
+
+
+@pytest.mark.parametrize(
+    ("projection", "lens", "configuration", "kind"), COMBINATIONS, ids=["-".join(c) for c in COMBINATIONS]
+)
+@pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
+def test_every_engine_agrees_with_the_definition(projection, lens, configuration, kind, backend, dtype):
+    pose, *case = case_of(projection, lens, configuration, kind)
     slack = 8 if kind == "needle" else 1  # their covariances alone cost four digits of seven
-    assert_same(gaussians, size, lens, options, generator, pose=pose, backend=backend, dtype=dtype, slack=slack)
+    cases.assert_matches_definition(*case, pose=pose, backend=backend, dtype=dtype, slack=slack)
 
 
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])

@@ -21,8 +21,8 @@ KINDS_OF_SCENE = st.sampled_from(cases.KINDS)
 SEEDS = st.integers(0, 2**31)
 SIZES = st.sampled_from([*cases.ODD_SIZES, (64, 32), (1, 1), (16, 16), (17, 3), (3, 40)])
 NEAR = st.sampled_from([0.0, 0.0, 0.02, 1.5])
-few = settings(max_examples=8, deadline=None, derandomize=True, database=None)
-more = settings(max_examples=20, deadline=None, derandomize=True, database=None)
+few = settings(max_examples=5, deadline=None, derandomize=True, database=None)
+more = settings(max_examples=10, deadline=None, derandomize=True, database=None)
 
 
 def unsure(gaussians: Gaussians, camera: Camera, options: RenderOptions, alpha: Tensor) -> Tensor:
