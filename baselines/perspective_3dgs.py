@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -53,14 +54,16 @@ class Cubemap3DGSMethod(SplatMethod):
     MODEL = CutModel
     CUT_FINENESS = FINENESS
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
+    TURNS: ClassVar[Tensor] = FACES  # [K, 3, 3] from the camera frame of a panorama to those of the views
+    SLOPE: ClassVar[float] = 1.0  # tan(field of view / 2); together the views cover every direction
     _views_per_step = 1  # cut views that cover the directions of a panorama once on average, for the scene of `fit`
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
         """Train on views cut from the panoramas; an iteration covers the sphere once."""
-        cut = perspective_scene(scene, self.turns(), self.lens)
+        cut = perspective_scene(scene, self.TURNS, self.lens)
         if scene.train:  # `Method.fit` refuses others
             lens = self.lens(Panorama(scene.train[0].width, scene.train[0].height))
-            times_seen = len(self.turns()) * solid_angle(lens) / (4 * math.pi)
+            times_seen = len(self.TURNS) * solid_angle(lens) / (4 * math.pi)
             self._views_per_step = max(1, round(len(cut.train) / len(scene.train) / times_seen))
         return super().fit(cut, budget, stage=stage)
 
@@ -88,13 +91,9 @@ class Cubemap3DGSMethod(SplatMethod):
         super()._refuse_impossible()
         check_camera(self.lens(Panorama(8, 4)), cut_view_options(self.render_config.options(scene_scale=1.0)))
 
-    def turns(self) -> Tensor:
-        """Return rotations [K, 3, 3] from the camera frame of a panorama to those of the views."""
-        return FACES
-
     def lens(self, panorama: Panorama) -> Pinhole:
-        """Return the camera of the views; together they cover every direction once."""
-        return square_lens(panorama, 1.0, FINENESS)
+        """Return the camera of the views."""
+        return square_lens(panorama, self.SLOPE, FINENESS)
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         each = self._views_per_step
@@ -104,15 +103,10 @@ class Cubemap3DGSMethod(SplatMethod):
 class Crops3DGSMethod(Cubemap3DGSMethod):
     """The same on twelve overlapping crops; see `Cubemap3DGSMethod`."""
 
+    TURNS = looking_at(ICOSAHEDRON)
+    SLOPE = math.tan(math.radians(FIELD_OF_VIEW / 2))
+
     def refuse_budget(self, budget: Budget) -> None:
         super().refuse_budget(budget)
         if budget.stop == "auto":
             raise ValueError("budget.stop is auto, but other crops overlap those that would be held out; set it to end")
-
-    def turns(self) -> Tensor:
-        """Return rotations [12, 3, 3] from the camera frame of a panorama to those of the crops."""
-        return looking_at(ICOSAHEDRON)
-
-    def lens(self, panorama: Panorama) -> Pinhole:
-        """Return the camera of the crops."""
-        return square_lens(panorama, math.tan(math.radians(FIELD_OF_VIEW / 2)), FINENESS)

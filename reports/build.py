@@ -11,7 +11,7 @@ from padgs.reports import REPORTS, frame, methods, published
 from padgs.reports.conditions import as_published, footnotes, refuse_mixture, unranked, unranked_notes
 from padgs.reports.frame import by_conditions, by_place, grouped, law, without_data
 from padgs.reports.measures import Measure, quantity
-from padgs.reports.published import AVERAGE, Place, Published
+from padgs.reports.published import AVERAGE, Place
 from padgs.reports.selection import Mixture, RunSet, experiment_of, one_setting, refuse_differences, settings
 from padgs.reports.significance import is_few, mean_cell, numbers_of, over_scenes, over_seeds, places, unrank
 from padgs.reports.specs import PREPARE, SPECS, TITLES
@@ -175,7 +175,7 @@ class _Builder:
             for measure, cell in zip(self.measures, unrank(ours) if value in not_ranked else ours, strict=True):
                 row.append(cell)
                 if self.paper and measure.published:
-                    row.append(_published(theirs[value].get(measure.published)))
+                    row.append(theirs[value].get(measure.published, Cell()))
                     if measure.difference:
                         row.append(_difference(cell, row[-1]) if comparable else Cell())
                 if self.spec.difference and measure.column.group == "PSNR":
@@ -311,12 +311,6 @@ class _Pivot(_Builder):
         titles = {preset: methods.title(preset) for preset in methods.ordered(cells)}
         rows = (Row(words, tuple(cells[of].get(key, (Cell(),))[0] for key in keys)) for of, words in titles.items())
         return [Block(title, tuple(rows))]
-
-
-def _published(number: Published | None) -> Cell:
-    if number is None or number.status == "missing":
-        return Cell()
-    return Cell(number.value, count=0, status="" if number.status == "ok" else number.status)
 
 
 def _by_seed(ours: DataFrame, theirs: DataFrame, measure: Measure) -> Cell:

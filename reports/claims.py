@@ -14,10 +14,10 @@ from padgs.reports import REPORTS, methods, published
 from padgs.reports.conditions import as_published, refuse_mixture
 from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
-from padgs.reports.published import DATASETS, NOT_TUNED_ON, TUNED_ON, Key, Place, Published
+from padgs.reports.published import DATASETS, NOT_TUNED_ON, TUNED_ON, Key, Place
 from padgs.reports.selection import Mixture, RunSet, one_setting, settings
 from padgs.reports.significance import CONFIDENCE, differ, failures, mean_cell, paired_test
-from padgs.reports.table import MISSING, ReportError
+from padgs.reports.table import MISSING, Cell, ReportError
 from padgs.reports.writers import Page, rendered
 from padgs.results import higher_is_better
 
@@ -123,11 +123,8 @@ def load() -> list[Claim]:
 
 
 def judge(claims: Sequence[Claim], run_set: RunSet) -> list[Evidence]:
-    """Test whether the mean advantages differ from zero: paired t-tests on the scenes' means over seeds, with Holm's
-    correction for all tested claims of the paper, and apart for all of this project.
-
-    A claim holds (is not reproduced) if the mean is significantly positive (negative), and no scene is otherwise beyond
-    the noise of seeds.
+    """Return the evidence for each claim: paired t-tests on the scenes' means over seeds, with Holm's correction for
+    all tested claims of the paper, and apart for those of this project; `findings.md.j2` states the rules.
     """
     found = [Evidence(claim, measured(claim, run_set)) for claim in claims]
     found = [replace(one, p=paired_test([*one.tested["advantage"]])[0]) if one.interval else one for one in found]
@@ -159,7 +156,7 @@ def _verdict(evidence: Evidence) -> str:
     return FAILS if as_published else f"{NOT_REPRODUCED} at {' and '.join(sizes)}"
 
 
-def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:
+def in_the_paper(claim: Claim, numbers: Mapping[Key, Cell]) -> dict[str, float]:
     """Return scene -> advantage over the best of the others in the paper's numbers."""
     name, found = claim.published_metric, {}
     known = {key: number.value for key, number in numbers.items() if number.value is not None}
@@ -198,11 +195,8 @@ def findings(run_set: RunSet) -> Page:
 
 
 def measured(claim: Claim, run_set: RunSet) -> DataFrame:
-    """Return a row for each scene: the advantage of the means over seeds over the best rival's.
-
-    Of the sizes and lengths that both sides have, those with `LEAST_SEEDS` of both count first, then the widest, then
-    the longest. Scenes that were not tuned on decide claims of our own alone, where there are any: nothing of the
-    paper's methods was chosen on a scene.
+    """Return a row for each scene: the advantage of the means over seeds over the best rival's, by the rules in
+    `findings.md.j2`.
     """
     runs = run_set.of_experiments(*claim.experiments)
     if claim.scenes:

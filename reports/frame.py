@@ -101,11 +101,8 @@ def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
 
 
 def law(iterations: int, method: str = "") -> float:
-    """Return the factor that `train.learning_rates=run` chooses: √(30 000 / iterations), in [1, 8].
-
-    For `LINEAR` methods it is 3000 / iterations, in the same limits.
-
-    A copy without torch; a test compares it with the one that trains.
+    """Return the factor that `train.learning_rates=run` chooses: √(30 000 / iterations), for `LINEAR` methods 3000 /
+    iterations, in [1, 8]. A copy without torch; a test compares it with the one that trains.
 
     >>> law(30_000), law(7500), law(100)
     (1.0, 2.0, 8.0)
@@ -236,11 +233,6 @@ def _factor(result: Result) -> float | None:
     return 1.0 if choice == "published" else float(choice)
 
 
-def _kinds(cameras: Mapping[str, str]) -> str | None:
-    """Return the number of test views of each kind of camera, "2 panorama, 1 pinhole"; None if all are panoramas."""
-    return ", ".join(f"{count} {kind}" for kind, count in Counter(cameras.values()).items()) or None
-
-
 def _searched(found: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what a search for the smallest model found, if it has the numbers that tables and charts show."""
     for step in found.get("steps", ()):
@@ -279,7 +271,8 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "place": lambda result: Place.of(result.dataset, result.scene, result.fingerprint),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: SAME_DATA.get(result.fingerprint[:10], result.fingerprint[:10]),
-    "cameras": lambda result: _kinds(result.cameras),
+    # test views of each kind, "2 panorama, 1 pinhole"; None: all are panoramas
+    "cameras": lambda result: ", ".join(f"{n} {kind}" for kind, n in Counter(result.cameras.values()).items()) or None,
     "length": lambda result: None if result.external else _length(result),
     "learning_rates": _learning_rates,
     "hardware": _hardware,

@@ -1,7 +1,6 @@
 """Numbers of runs that reports compare, with their columns and the paper's names for them."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 from pandas import DataFrame
 
@@ -49,20 +48,15 @@ _COSTS = (
 COSTS = {measure.name: measure for measure in _COSTS}
 
 
-def costs(*names: str, **changes: Any) -> tuple[Measure, ...]:
-    """Return some of `COSTS`, with changes to their columns."""
-    return tuple(replace(COSTS[name], column=replace(COSTS[name].column, **changes)) for name in names)
-
-
-def metric(protocol: str, name: str, group: str = "", **changes: Any) -> Measure:
-    """Return a metric under a protocol, with changes to its column.
+def metric(protocol: str, name: str, group: str = "") -> Measure:
+    """Return a metric under a protocol.
 
     >>> metric("sphere", "ws_psnr_pole").column.heading, metric("paper", "lpips_vgg_01").column.heading
     ('WS-PSNR pole ↑', 'LPIPS VGG [0, 1] ↓')
     """
     title = " ".join(TITLES.get(word, word) for word in name.split("_")).replace("WS ", "WS-")
     column = DEPTH.get(name) or Column(title, 2 if "psnr" in name else 3, higher_is_better(name))
-    return Measure(f"{protocol}/{name}", replace(column, group=group, **changes))
+    return Measure(f"{protocol}/{name}", replace(column, group=group))
 
 
 def metrics(protocol: str) -> tuple[Measure, ...]:

@@ -13,6 +13,7 @@ from padgs.checks import printable
 METHODS = yaml.safe_load(Path(__file__).with_name("methods.yaml").read_text("utf-8"))
 STATUS = {preset: words for method in METHODS.values() for preset, words in method.get("presets", {}).items()}
 COLOR = re.compile("#[0-9a-fA-F]{6}")
+OTHERS = tuple(point.name for point in entry_points(group="padgs.methods"))  # methods of other packages
 EXTERNAL = "external: "  # presets of models and renders that another program made begin with it; their label follows
 
 
@@ -29,11 +30,6 @@ def outside(method: str, attribute: str) -> str:
     return ""
 
 
-@cache
-def _others() -> tuple[str, ...]:
-    return tuple(point.name for point in entry_points(group="padgs.methods"))
-
-
 def color(method: str) -> str:
     """Return the colour of a method as #rrggbb; empty if it has none."""
     return METHODS[method]["color"] if method in METHODS else outside(method, "color")
@@ -45,7 +41,7 @@ def method_of(preset: str) -> str:
     >>> method_of("odgs_release"), method_of("padgs_plus"), method_of("my_own")
     ('odgs', 'padgs_plus', 'my_own')
     """
-    known = [method for method in (*METHODS, *_others()) if preset == method or preset.startswith(f"{method}_")]
+    known = [method for method in (*METHODS, *OTHERS) if preset == method or preset.startswith(f"{method}_")]
     return max(known, key=len, default=preset)
 
 

@@ -7,8 +7,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
+
+from padgs.reports.table import Cell
 
 FILE = Path(__file__).resolve().parent.parent / "baselines" / "published.csv"  # in a checkout and when installed
 PROTOCOL = "paper"  # the only protocol under which ours may stand beside published numbers
@@ -26,8 +29,7 @@ SEEN = {  # beginning of the fingerprint of a capture, or name of a generated sc
 OUTDOOR = {"outdoor", "garden", "plaza", "courtyard", "park", "street"}  # words of names; all others are for Table 1
 
 
-@dataclass(frozen=True)
-class Key:
+class Key(NamedTuple):
     """Position of a published number."""
 
     table: int
@@ -35,14 +37,6 @@ class Key:
     scene: str
     method: str
     metric: str
-
-
-@dataclass(frozen=True)
-class Published:
-    """A published number, or the status that stands in its place."""
-
-    value: float | None
-    status: str  # ok, oom, missing
 
 
 @dataclass(frozen=True)
@@ -117,22 +111,23 @@ class Place:
         return first, seen, self.dataset, self.scene, self.apart
 
 
-def load() -> Mapping[Key, Published]:
+def load() -> Mapping[Key, Cell]:
     """Return all published numbers; a FileNotFoundError says that the file is missing from the package."""
     with FILE.open(newline="") as file:
         rows = [{**row, "scene": SCENES.get(row["scene"], row["scene"])} for row in csv.DictReader(file)]
     keys = (Key(int(of["table"]), of["dataset"], of["scene"], of["method"], of["metric"]) for of in rows)
-    numbers = (Published(float(of["value"]) if of["value"] else None, of["status"]) for of in rows)
-    return dict(zip(keys, numbers, strict=True))
+    values = ((of["value"], of["status"].removeprefix("missing")) for of in rows)
+    cells = (Cell(float(value), count=0) if value else Cell(status=status) for value, status in values)
+    return dict(zip(keys, cells, strict=True))
 
 
-def row(numbers: Mapping[Key, Published], table: int, place: Place, method: str) -> dict[str, Published]:
+def row(numbers: Mapping[Key, Cell], table: int, place: Place, method: str) -> dict[str, Cell]:
     """Return metric -> number of a method on a scene; empty where the paper has none."""
     where = (table, DATASETS.get(place.dataset), place.scene, method)
     return {k.metric: n for k, n in numbers.items() if (k.table, k.dataset, k.scene, k.method) == where}
 
 
-def mean_row(numbers: Mapping[Key, Published], table: int, places: list[Place], method: str) -> dict[str, Published]:
+def mean_row(numbers: Mapping[Key, Cell], table: int, places: list[Place], method: str) -> dict[str, Cell]:
     """Return metric -> mean of a method over some scenes of a data set, where the paper has a number for each."""
     dataset = places[0].dataset
     if {place.scene for place in places} == {*scenes(numbers, DATASETS[dataset])}:
@@ -140,10 +135,10 @@ def mean_row(numbers: Mapping[Key, Published], table: int, places: list[Place], 
     rows = [row(numbers, table, place, method) for place in places]
     known = [{name: number.value for name, number in own.items() if number.value is not None} for own in rows]
     shared = set.intersection(*map(set, known))
-    return {name: Published(sum(own[name] for own in known) / len(known), "ok") for name in shared}
+    return {name: Cell(sum(own[name] for own in known) / len(known), count=0) for name in shared}
 
 
-def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:
+def scenes(numbers: Mapping[Key, Cell], dataset: str) -> list[str]:
     """Return the folder names of a data set's scenes, in the paper's order; `dataset` as the paper calls it."""
     found = dict.fromkeys(key.scene for key in numbers if key.dataset == dataset and key.table < 3)
     return [scene for scene in found if scene != AVERAGE]

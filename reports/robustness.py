@@ -211,7 +211,7 @@ def limits(run_set: RunSet) -> Table:
     return Table("limits", "Losses of methods under stress, and their limits", "Condition", columns, (*blocks,), notes)
 
 
-@styled
+@styled()
 def heat_map(title: str, stressed: Sequence[StressedMethod]) -> Chart:
     """Return a row per condition at `SHOWN_LEVEL` and a column per method that was run under all of them.
 

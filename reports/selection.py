@@ -1,11 +1,11 @@
 """Runs for a report: the request, the settings among the runs, and what happens to runs that must not be mixed."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from importlib import import_module
 from itertools import chain
+from pkgutil import resolve_name
 from typing import Any
 
 import pandas as pd
@@ -78,24 +78,18 @@ class RunSet:
 
     def report(self, name: str) -> Any:
         """Return a report; runs that must not be mixed are separated, unless the request is strict."""
-        if name not in self._made:
-            function, _, argument = REPORTS[name].function.partition(" ")
-            module, _, function = function.partition(":")
-            self._made[name] = self._separated(name, getattr(import_module(module), function), *argument.split())
-        return self._made[name]
-
-    def _separated(self, name: str, function: Callable[..., Any], *arguments: str) -> Any:
+        function, *arguments = REPORTS[name].function.split()
         run_set, warnings = self, dict[str, None]()
-        while True:
+        while name not in self._made:
             try:
-                made = function(run_set, *arguments)
+                self._made[name] = resolve_name(function)(run_set, *arguments)
                 self.warnings.extend(warnings)
-                return made
             except Mixture as mixture:
                 if self.request.strict:
                     raise
                 warnings[f"{name}: {mixture.what}; they are separated, and --where chooses"] = None
                 run_set = replace(run_set, runs=separate(run_set.runs, mixture), _made={})
+        return self._made[name]
 
     def chosen(self, name: str) -> DataFrame:
         """Return the runs for a report: of the requested experiment, else scene by scene of the report's own

@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from pandas import DataFrame
 
 from padgs.reports.measures import Measure
 from padgs.reports.published import Place
-from padgs.reports.selection import Setting
 from padgs.reports.table import Block, Cell, Column, Row, format_number
 
 BEST, SECOND = "best", "second"
@@ -29,12 +28,6 @@ def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:
     """Return a cell for each measure: mean and deviation over successful runs, and the status of failed ones."""
     failed = failures(runs)
     return [mean_cell(column[~np.isnan(column)].tolist(), failed) for column in numbers_of(runs, measures).T]
-
-
-def failure_notes(found: Iterable[Setting]) -> list[str]:
-    """Return a sentence that names the settings with failed runs; none if all ended well."""
-    failed = [f"{one.title} ({words.upper()})" for one in found if (words := failures(one.runs))]
-    return [f"Failed runs are left out: {'; '.join(failed)}."] if failed else []
 
 
 def failures(runs: DataFrame) -> str:

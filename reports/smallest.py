@@ -1,11 +1,9 @@
 """Smallest models of a quality (`padgs smallest`): a table, and charts of quality over Gaussians, bytes and time."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from pandas import DataFrame
 
 from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, set_axis, spans, styled
@@ -48,10 +46,6 @@ class Curve:
     def smallest(self) -> dict[str, Mapping[str, Any]]:
         """Allowed loss, as text -> smallest model."""
         return {epsilon: self.found["steps"][number] for epsilon, number in self.found["minimal"].items()}
-
-    def values(self, name: str) -> list[float]:
-        """Return a number of all candidates; NaN where missing."""
-        return [np.nan if step[name] is None else step[name] for step in self.steps]
 
     def quality_of(self, step: Mapping[str, Any]) -> float:
         """Return WS-PSNR (dB) of the searched run less the loss of a candidate against the control.
@@ -123,12 +117,12 @@ def charts(run_set: RunSet) -> list[Chart]:
     return found
 
 
-@styled
+@styled()
 def _chart(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) -> Chart:
     made, axes = figure(len(PANELS), 1, 3.6, 3.4)
     presets = [curve.preset for curve in found]
     for panel, (quantity, words, unit) in zip(axes.flat, PANELS, strict=True):
-        sizes = [v * unit for curve in found for v in curve.values(quantity) if math.isfinite(v)]
+        sizes = [unit * step[quantity] for curve in found for step in curve.steps]
         set_axis(panel.xaxis, sizes, spans(sizes, LOG_RATIO))
         for method, seeds in by_method(found).items():
             color = color_of(seeds[0].preset, presets)
@@ -147,10 +141,9 @@ def _chart(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) ->
 
 def _draw(panel: Any, curve: Curve, quantity: str, unit: float, color: str, *, first: bool) -> None:
     """Draw a curve; further seeds of a method are thinner."""
-    xs = [value * unit for value in curve.values(quantity)]
+    xs = [unit * step[quantity] for step in curve.steps]
     ys = list(map(curve.quality_of, curve.steps))
-    there = sorted((x, y) for x, y in zip(xs, ys, strict=True) if math.isfinite(x) and math.isfinite(y))
-    panel.plot(*zip(*there, strict=True), color=color, linewidth=1.2 if first else 0.6)
+    panel.plot(*zip(*sorted(zip(xs, ys, strict=True)), strict=True), color=color, linewidth=1.2 if first else 0.6)
     for step, x, y in zip(curve.steps, xs, ys, strict=True):
         panel.plot([x], [y], MARKERS[0], color=color, markersize=4 if first else 2.5)
         for loss, around in zip(LOSSES, MARKERS, strict=False):

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 from pandas import DataFrame
 from PIL import Image
 
-from padgs.files import file_name, write_atomically
+from padgs.files import file_name
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.significance import BEST, marks
 from padgs.reports.table import Table
@@ -73,13 +73,6 @@ def rendered(template: str, **values: Any) -> str:
     environment = Environment(loader=loader, autoescape=escape, undefined=StrictUndefined, **lines)
     environment.filters["md"] = markdown_text
     return environment.get_template(template).render(**values)
-
-
-def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
-    """Write the files of a report, name -> content, each atomically; the old one stays after an OSError."""
-    for file, content in texts.items():
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / file, content)
 
 
 def rows_of(table: Table) -> Iterator[tuple[str, list[tuple[str, str | None]]]]:

@@ -10,8 +10,9 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +75,13 @@ def split(
             given[key] = f"{inverted}{path}"
     written = {}
     destination.parent.mkdir(parents=True, exist_ok=True)
-    with draft_of(destination) as partial:
-        partial.mkdir()
-        np.savez(partial / REGIONS, points=blocks.points.numpy(), owner=blocks.owner.astype(np.int16))
-        digest = hashlib.sha256((partial / REGIONS).read_bytes()).hexdigest()
+    with draft_of(destination) as draft:
+        draft.mkdir()
+        np.savez(draft / REGIONS, points=blocks.points.numpy(), owner=blocks.owner.astype(np.int16))
+        digest = hashlib.sha256((draft / REGIONS).read_bytes()).hexdigest()
         for number, core in enumerate(blocks.core):
             name = f"{scene.name}-block-{number + 1}"
-            folder, final = partial / name, destination / name
+            folder, final = draft / name, destination / name
             folder.mkdir()
             margin, held = blocks.margin[number], blocks.held[number]
             sides = {"train": [*core, *margin], "test": blocks.test[number]}
@@ -102,36 +103,28 @@ def split(
                 tracks=None,
                 split={side: tuple(frames[v.name].name for v in part) for side, part in sides.items() if scene.test},
             )
-            write_transforms(content, folder)
-            within = {view.name: partial_mask(view, held[view.name]) for view in (*core, *margin) if view.name in held}
+            within = {v.name: partial(mask_within, v, held[v.name]) for v in (*core, *margin) if v.name in held}
             write_depths(views, folder)
             write_masks({view.name: within.get(view.name, masks[view.name]) for view in views}, folder)
-            masks_meant = {"mask": "masks"} if (folder / "masks").is_dir() else {}  # they hide most of a view
-            more = masks_meant | ({REDUCED: capture.width} if capture.width else {})
-            described = json.loads((file := folder / "transforms.json").read_text(encoding="utf-8"))
-            file.write_text(json.dumps(described | more, ensure_ascii=False), encoding="utf-8")
+            more: dict[str, Any] = {"mask": "masks"} if (folder / "masks").is_dir() else {}  # they hide most of a view
+            more |= {REDUCED: capture.width} if capture.width else {}
+            write_transforms(content, folder, **more)
             block = {"number": number, "count": count, "format": format, "options": given, "regions": digest}
             block["source"] = os.path.relpath(source.resolve(), final.resolve())
             (folder / BLOCK).write_text(json.dumps(block, indent=1))
             parts = f"{len(core)} training views, {len(margin)} in the margin, {len(blocks.test[number])} test views"
             written[final] = f"{parts}, {int(kept.sum())} points"
-        os.replace(partial, destination)
+        os.replace(draft, destination)
     return written, scene.notes
 
 
-def partial_mask(view: View, held: np.ndarray) -> Callable[[], Tensor]:
-    """Return a function that loads the mask of a view, restricted to directions [ROWS, 2 ROWS]."""
-
-    def load() -> Tensor:
-        rows, columns = (
-            torch.arange(size) * count // size
-            for size, count in zip((view.height, view.width), held.shape, strict=True)
-        )
-        inside = torch.from_numpy(held)[rows][:, columns].float()
-        mask = view.mask()
-        return inside if mask is None else inside * mask
-
-    return load
+def mask_within(view: View, held: np.ndarray) -> Tensor:
+    """Return the mask of a view, restricted to directions [ROWS, 2 ROWS]."""
+    sizes = zip((view.height, view.width), held.shape, strict=True)
+    rows, columns = (torch.arange(size) * count // size for size, count in sizes)
+    inside = torch.from_numpy(held)[rows][:, columns].float()
+    mask = view.mask()
+    return inside if mask is None else inside * mask
 
 
 def merge(folders: Sequence[str], console: Console, *, data: str = "", device: str = "auto") -> Path:
@@ -239,23 +232,17 @@ def _block_of(run: LoadedRun) -> dict[str, Any]:
 
 def _refuse_other(run: LoadedRun, first: LoadedRun) -> None:
     """Refuse a run that did not end well, or that cannot be joined with the first one."""
-    config, train = run.config, run.config.train
+    config, other = run.config, first.config
+    own, usual = config.data.split, "all" if other.data.split == "all" else "auto"
+    is_explicit = isinstance(run.method.model, SplatModel)
+    is_alike = (config.method, config.options, config.render) == (other.method, other.options, other.render)
     troubles = {
         "did not end well; start it again": run.result is None or not run.result.ok,
-        f"is of {config.method}, whose parts share parameters; merge explicit Gaussians": not isinstance(
-            run.method.model, SplatModel
-        ),
-        "learned poses, exposures or a lens, which differ between blocks; leave them given": not (
-            train.exposures == train.poses == train.lens == "given"
-        ),
+        f"is of {config.method}, whose parts share parameters; merge explicit Gaussians": not is_explicit,
+        "learned poses, exposures or a lens, which differ between blocks; leave them given": run.method.calibrates,
         "was trained under stress; merge runs without": bool(config.stress.title),
-        f"has data.split={config.data.split}, with other test views than the whole; train with auto, or all with all": (
-            config.data.split not in (("all",) if first.config.data.split == "all" else ("auto",))
-        ),
-        f"has other settings of method or render than {first.folder}; train them alike": (
-            (config.method, config.options, config.render)
-            != (first.config.method, first.config.options, first.config.render)
-        ),
+        f"has data.split={own}, with other test views than the whole; train with auto, or all with all": own != usual,
+        f"has other settings of method or render than {first.folder}; train them alike": not is_alike,
     }
     for trouble, holds in troubles.items():
         if holds:

@@ -205,14 +205,10 @@ def mark_spherical(video: Path) -> None:
     """Mark an .mp4 with one track, whose index is the last box, as an equirectangular panorama, in place."""
     with video.open("r+b") as file:
         *_, (kind, start, size) = _boxes(file, 0, file.seek(0, 2))
-        if kind != b"moov":
-            raise ValueError(f"{video} ends with a box {kind.decode('latin1')!r}; it must end with the index, moov")
+        assert kind == b"moov", "libavformat writes the index last"
         file.seek(start)
         index = file.read(size)
-        boxes = _boxes(BytesIO(index), 8, size)
-        if (track := next((box for box in boxes if box[0] == b"trak"), None)) is None:
-            raise ValueError(f"{video} has no track; encode it again")
-        _, at, length = track
+        at, length = next((at, length) for kind, at, length in _boxes(BytesIO(index), 8, size) if kind == b"trak")
         content = SPHERICAL + XML.encode()
         box = struct.pack(">I4s", 8 + len(content), b"uuid") + content
         file.seek(start)

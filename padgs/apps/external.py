@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from copy import copy, deepcopy
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,10 @@ from torch import Tensor
 
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import CONVERTED, read_splats
-from padgs.apps.frame_check import FrameCheck, as_numbers, check_frame, nerfstudio_similarity, read_transform
+from padgs.apps.frame_check import FrameCheck, as_numbers, check_frame, read_transform
 from padgs.checks import unknown
 from padgs.data.capture import FARTHEST, DataError, listed
-from padgs.data.formats.path_file import TRANSFORMS
+from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
 from padgs.data.formats.transforms import transforms_file
 from padgs.data.images import decode, inspect
 from padgs.data.perturb import StressOptions
@@ -70,17 +70,14 @@ class ExternalMethod(SplatMethod):
     @classmethod
     def of(cls, splats: Splats, render: RenderConfig) -> ExternalMethod:
         """Return the method for some Gaussians."""
-        method = cls(render=render)
+        method = cls()
+        method.render_config = render  # which need not be able to draw panoramas
         method._model = SplatModel(splats, SplatOptions(), render, extent=1.0, iterations=1)
         return method
 
     def with_renderer(self, render: RenderConfig) -> ExternalMethod:
         """Return a copy with other render settings."""
-        other = copy(self)  # not constructed again: it need not be able to draw panoramas
-        other.render_config = render
-        splats = deepcopy(self.model.splats)
-        other._model = SplatModel(splats, SplatOptions(), render, extent=1.0, iterations=1)
-        return other
+        return self.of(deepcopy(self.model.splats), render)
 
 
 def is_splat_file(path: str) -> bool:
@@ -183,7 +180,7 @@ class ExternalRun(LoadedRun):
         known, nerfstudio = self.folder.parent / TRANSFORMS, None
         if known.is_file():
             shift = Similarity(translation=-self.scene.origin.double().cpu())
-            nerfstudio = shift @ nerfstudio_similarity(known, _transforms_json(self.config))
+            nerfstudio = shift @ nerfstudio_world(known, _transforms_json(self.config))
         others = {name: self.method.with_renderer(rays).render for name, rays in RAYS.items()}
         found = check_frame(self.scene, self.method.render, opaque, nerfstudio, others)
         if found.suggestion is None:

@@ -37,18 +37,16 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
     """
     if text == IDENTITY:
         return Similarity()
-    file = Path(text)
+    file, is_file = Path(text), os.path.isfile(text)  # Path.is_file refuses long texts
     try:
-        if not os.path.isfile(file):  # Path.is_file refuses long texts
-            numbers: Any = [float(number) for number in text.replace(",", " ").split()]
-        elif file.suffix == ".npy":
-            numbers = np.load(file)
-        elif file.suffix == ".json":
+        if is_file and file.suffix == ".npy":
+            numbers: Any = np.load(file)
+        elif is_file and file.suffix == ".json":
             numbers = json.loads(file.read_text())
             if isinstance(numbers, dict):
-                return nerfstudio_similarity(file, transforms_json)
+                return nerfstudio_world(file, transforms_json)
         else:
-            numbers = file.read_text().replace(",", " ").split()
+            numbers = (file.read_text() if is_file else text).replace(",", " ").split()
         matrix = np.asarray(numbers, np.float64).reshape(-1, 4)
     except DataError as error:  # which would be taken for one of the run's data
         raise ValueError(str(error)) from error
@@ -73,12 +71,6 @@ def _similarity(matrix: np.ndarray, text: str) -> Similarity:
         raise ValueError(f"--transform {text} shears, or scales axes differently; {rule}")
     u, _, vh = np.linalg.svd(rotation)
     return Similarity(float(scale), torch.from_numpy(u @ vh), torch.from_numpy(matrix[:3, 3].copy()))
-
-
-def nerfstudio_similarity(file: Path, transforms_json: Path | None) -> Similarity:
-    """Return scene_from_file of Gaussians in nerfstudio's world; a DataError if the file does not say it."""
-    scale, transform = nerfstudio_world(file, transforms_json)
-    return Similarity(scale, transform[:3, :3], scale * transform[:3, 3]).inverse()
 
 
 def as_numbers(similarity: Similarity) -> str:

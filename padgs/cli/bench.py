@@ -33,7 +33,7 @@ def bench(
     options = replace(usual, sizes=sizes, device=device, seed=seed, **counts)
     file, console = Path(out) / "bench.json", Console(highlight=False)
     with console.status("measuring") as status, name_place(file, "--out"):
-        report = measure_all(options, lambda what: status.update(f"measuring {what}"), file)
+        report = measure_all(options, file, lambda what: status.update(f"measuring {what}"))
     for line in lines(report):
         console.print(line)
     show(f"written: {file}")

@@ -19,17 +19,10 @@ from padgs.runs.interrupt import ending_by_signals
 Run = Annotated[str, typer.Argument(help="folder of a run, as padgs-run names it at its end")]
 Model = Annotated[str, typer.Argument(help="folder of a run, or a .ply, .compressed.ply, .spz or .sog of Gaussians")]
 Rays = Annotated[str, typer.Option(help="how to draw a file of Gaussians: exact, or ewa as ordinary viewers do")]
-Transform = Annotated[
-    str, typer.Option(help="from the file's world to the scene's: 4x4 matrix, 12 numbers, a file, or identity")
-]
-DataPath = Annotated[
-    str | None,
-    typer.Option("--data", help="data set, if it has moved since the run; for a file of Gaussians also a run on it"),
-]
+Transform = Annotated[str, typer.Option(help="scene from file: 4x4 matrix, 12 numbers, a file, or identity")]
+DataPath = Annotated[str | None, typer.Option("--data", help="data set, if it has moved; of Gaussians also a run")]
 Format = Annotated[str, typer.Option(help="format of the data set; auto: find out")]
-Mask = Annotated[
-    str, typer.Option(help="auto, none, inverted, rows:959/1024, or a file or folder; 255 marks pixels that are used")
-]
+Mask = Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, a file or folder; 255 marks used pixels")]
 Depth = Annotated[str, typer.Option(help="auto, or none: ignore depth maps")]
 Points = Annotated[str, typer.Option(help="auto, random, or a PLY, LAS or E57 file of starting points")]
 Images = Annotated[str, typer.Option(help="image folder, if not the usual one")]

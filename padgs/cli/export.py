@@ -12,15 +12,9 @@ def export(
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
     smooth: Annotated[bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html does")] = False,
-    degree_3: Annotated[
-        bool, typer.Option("--degree-3", help="zeros for higher harmonics in the .ply; some programs read no others")
-    ] = False,
-    distillation_steps: Annotated[
-        int | None, typer.Option(help="iterations that fit Gaussians to renders of PaD-GS or padgs+; default 300")
-    ] = None,
-    crop: Annotated[
-        str, typer.Option(help="box of the scene to keep, six numbers: lowest and highest x y z; padgs view shows them")
-    ] = "",
+    degree_3: Annotated[bool, typer.Option("--degree-3", help="fill up with zeros, if programs need it")] = False,
+    distillation_steps: Annotated[int | None, typer.Option(help="iterations of a fit to renders; default 300")] = None,
+    crop: Annotated[str, typer.Option(help="box to keep: lowest and highest x y z, as padgs view shows them")] = "",
     data: DataPath = None,
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply.

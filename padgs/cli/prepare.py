@@ -28,9 +28,7 @@ Metres = Annotated[
     tuple[str, str, float] | None,
     typer.Option(metavar="A B DISTANCE", help="scale the world: panoramas A and B were taken DISTANCE metres apart"),
 ]
-CameraHeight = Annotated[
-    float | None, typer.Option(help="scale the world: metres from the floor, which must be seen, to the cameras")
-]
+CameraHeight = Annotated[float | None, typer.Option(help="scale the world: metres from the floor to the cameras")]
 Gps = Annotated[bool, typer.Option("--gps", help="scale and turn the world by the GPS in the EXIF of the images")]
 
 
@@ -47,9 +45,7 @@ def prepare(
     metres: Metres = None,
     camera_height: CameraHeight = None,
     gps: Gps = False,
-    threads: Annotated[
-        int, typer.Option(help="number of threads; 0: one per core, at most 8, as memory allows; fewer use less memory")
-    ] = 0,
+    threads: Annotated[int, typer.Option(help="0: one per core, at most 8, as memory allows; fewer use less")] = 0,
 ) -> None:
     """Find the poses of panoramas, then check the result. After an interruption, the same command continues."""
     from pathlib import Path

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from padgs.cli.errors import name_place, show
+from padgs.files import write_atomically
 from padgs.reports import REPORTS, store
 from padgs.reports.table import ReportError
 from padgs.results import FILE_NAME, STOP_REQUESTED
@@ -39,7 +40,7 @@ def report(
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from padgs.reports.frame import frame
     from padgs.reports.selection import Request, RunSet, names_of
-    from padgs.reports.writers import files, write_files  # imports pandas, so not at the top
+    from padgs.reports.writers import files  # imports pandas, so not at the top
 
     names = {"metrics": names_of(metric), "methods": names_of(method), "scenes": names_of(scene)}
     request = Request(protocol, mix, strict, experiment=experiment, where=_pairs(where), **names)
@@ -75,7 +76,9 @@ def report(
         with name_place(target, "--out"):
             for ending in ("md", "tex", "csv") if is_table and f"{name}.md" not in texts else ():
                 (target / f"{name}.{ending}").unlink(missing_ok=True)  # an old table must not lie beside new ones
-            write_files(texts, target)
+            for file, content in texts.items():
+                target.mkdir(parents=True, exist_ok=True)
+                write_atomically(target / file, content)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     without = f", and {refused} reports without a table" if refused else ""

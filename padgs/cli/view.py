@@ -19,9 +19,7 @@ def view(
     run: Model,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
     port: Annotated[int | None, typer.Option(help="first port to try; default 8080")] = None,
-    host: Annotated[
-        str | None, typer.Option(help="0.0.0.0 serves all who have the printed address; default: this machine only")
-    ] = None,
+    host: Annotated[str | None, typer.Option(help="0.0.0.0: all who have the address; default: this machine")] = None,
     data: DataPath = None,
     rays: Rays = "exact",
     transform: Transform = "",
@@ -36,20 +34,18 @@ def view(
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.external import is_splat_file, open_model
 
-        runs: list[LoadedRun] = []
         files = [folder for folder in folders if is_splat_file(folder)]
         place = data or next((folder for folder in folders if folder not in files), None)
         for folder in folders:
             wait_for_checkpoint(folder)
         for folder in folders:
             stated = (rays, transform) if folder in files or not files else ()  # a run beside a file has its own
-            runs.append(open_model(folder, place if folder in files else data, *stated))
-            for note in runs[-1].notes:
+            opened.append(open_model(folder, place if folder in files else data, *stated))
+            for note in opened[-1].notes:
                 show(f"  {note}")
-        if len(names := [*dict.fromkeys(found.scene.name for found in runs)]) > 1:
+        if len(names := [*dict.fromkeys(found.scene.name for found in opened)]) > 1:
             raise ValueError(f"{run} and {beside} are of two scenes, {' and '.join(names)}; name two runs of one scene")
-        opened[:] = runs
-        return runs
+        return opened
 
     if not all(Path(folder).is_file() or (Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
         of_one_scene()  # raises before the page is served

@@ -64,7 +64,9 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     if target is None and capture.width is not None and images[0].width > capture.width:
         target = capture.width
     factor = 1.0 if target is None else target / images[0].width  # of photographs beside panoramas
-    sizes = [_view_size(image, target) for image in images[:panoramas]]
+    if target and (small := next((image for image in images[:panoramas] if image.width < target), None)):
+        raise DataError(f"data.width={target} is wider than {small.path} ({small.width}); images are only reduced")
+    sizes = [(image.width, image.height) if target is None else (target, target // 2) for image in images[:panoramas]]
     sizes += [
         (max(MIN_SIDE, round(factor * image.width)), max(MIN_SIDE, round(factor * image.height)))
         for image in images[panoramas:]
@@ -318,11 +320,3 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
             differ = "; but ".join(list(of_camera.values())[:2])
             raise DataError(f"images and cameras disagree in size: {differ}; make them agree")
     return [f"images: {text}; used as they are" for of in scales.values() for scale, text in of.items() if scale != 1]
-
-
-def _view_size(image: ImageFile, width: int | None) -> tuple[int, int]:
-    if width is None:
-        return image.width, image.height
-    if width > image.width:
-        raise DataError(f"data.width={width} is wider than {image.path} ({image.width}); images are only reduced")
-    return width, width // 2

@@ -144,10 +144,10 @@ def decode(path: Path, mode: str = "RGB", within: Crop | None = None) -> NDArray
     return _decode(read_bytes(path), path, mode, within)
 
 
-def save_png(pixels: Tensor, path: Path) -> None:
+def save_png(pixels: Tensor, path: Path, *, compress_level: int = 6) -> None:
     """Save pixels [H, W, 3] or [H, W] in 0..255, rounded, as PNG; creates the folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
+    Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path, compress_level=compress_level)
 
 
 def _decode(data: bytes, path: Path, mode: str, within: Crop | None = None) -> NDArray[np.uint8]:

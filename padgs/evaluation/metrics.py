@@ -32,12 +32,12 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     >>> psnr(torch.full((2, 4, 3), 1.0), torch.zeros(2, 4, 3)).item()  # -10 log10(1)
     -0.0
     """
-    return _decibel(weighted_mean((image - target) ** 2, _ones(image) if mask is None else mask))
+    return -10 * torch.log10(weighted_mean((image - target) ** 2, _ones(image) if mask is None else mask))
 
 
 def ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the PSNR in dB with each row weighted by its solid angle (Sun, Lu, Yu 2017)."""
-    return _decibel(weighted_mean((image - target) ** 2, sphere_weight(image, mask)))
+    return psnr(image, target, sphere_weight(image, mask))
 
 
 def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -54,7 +54,7 @@ def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) ->
 def band_ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None, *, band: str) -> Tensor:
     """Return `ws_psnr` of the rows whose centres lie in a latitude band of `BANDS`; NaN if there is no such row."""
     inside = band_rows(image.shape[0], band, device=image.device)
-    return _decibel(weighted_mean((image - target) ** 2, sphere_weight(image, mask) * inside[:, None]))
+    return psnr(image, target, sphere_weight(image, mask) * inside[:, None])
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -123,10 +123,6 @@ def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
     Values without weight may be NaN.
     """
     return (torch.where(weight > 0, values.mean(-1), 0) * weight).sum() / weight.sum()
-
-
-def _decibel(mean_square: Tensor) -> Tensor:
-    return -10 * torch.log10(mean_square)
 
 
 def _ones(image: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from padgs.native import cpu, cuda
+from padgs.native.loading import succeeds
 
 LIBRARIES = {"cpu": cpu, "cuda": cuda}  # by torch device type
 
@@ -13,5 +14,6 @@ LIBRARIES = {"cpu": cpu, "cuda": cuda}  # by torch device type
 def library_for(tensor: Tensor) -> ModuleType | None:
     """Return the module of the library that takes a float32 tensor on its device; None if torch must do it."""
     library = LIBRARIES.get(tensor.device.type)
-    fits = library is not None and tensor.dtype == torch.float32 and library.works_on(tensor.device)
-    return library if fits else None
+    if library is None or tensor.dtype != torch.float32:
+        return None
+    return library if succeeds(lambda: library.require(tensor.device)) else None

@@ -58,11 +58,6 @@ def workspace(size_of: str, height: int, width: int) -> torch.Tensor:
     return torch.zeros(getattr(library(), size_of)(height, width), dtype=torch.float32)
 
 
-def works_on(_: torch.device) -> bool:
-    """Return whether the library is available; every CPU can run it."""
-    return available()
-
-
 def require(_: torch.device) -> None:
     """Raise OSError, as `library` does, if the library is not available."""
     library()

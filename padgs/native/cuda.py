@@ -158,11 +158,6 @@ def available() -> bool:
     return succeeds(library)
 
 
-def works_on(device: torch.device) -> bool:
-    """Return whether the library is available and was compiled for this GPU."""
-    return succeeds(lambda: require(device))
-
-
 def require(device: torch.device) -> None:
     """Raise OSError or RuntimeError, as `library` and `queue` do, if nothing can be rendered on this device."""
     library()

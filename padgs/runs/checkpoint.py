@@ -30,11 +30,6 @@ class CheckpointError(RuntimeError):
     """A checkpoint cannot be written or is not what was written; the message names the file and the way out."""
 
 
-def exists(folder: Path) -> bool:
-    """Return whether the folder holds a checkpoint, even a damaged one."""
-    return (folder / MANIFEST).exists()
-
-
 def digest(folder: Path) -> str:
     """Return the SHA-256 of the tensors of a checkpoint; if it cannot be read, raise a CheckpointError."""
     return _manifest(folder)["sha256"]

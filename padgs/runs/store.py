@@ -123,7 +123,7 @@ class RunStore:
     @property
     def has_checkpoint(self) -> bool:
         """True if there is a checkpoint, even a damaged one."""
-        return checkpoint.exists(self.checkpoint)
+        return (self.checkpoint / checkpoint.MANIFEST).exists()
 
     @property
     def has_result(self) -> bool:

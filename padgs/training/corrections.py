@@ -7,10 +7,8 @@ and offsets per channel (as in URF, Rematas et al. 2022, but diagonal); their me
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -18,19 +16,14 @@ from torch import Tensor, nn
 from padgs.data.camera_paths import centers
 from padgs.gaussians import rotation_matrices
 from padgs.geometry.camera import Panorama
-from padgs.geometry.lens import AXES
 from padgs.geometry.similarity import Similarity
 from padgs.scene import Scene, View
 from padgs.training.lenses import ROUGHNESS_WEIGHT, CameraMap, DualLens
 from padgs.training.model import Model, TrainingRender
+from padgs.training.options import FISHEYES, GIVEN, LEARNED, LEARNED_FAST, MAP, TrainOptions
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
 from padgs.training.targets import Target
 
-if TYPE_CHECKING:
-    from padgs.training.options import TrainOptions
-
-GIVEN, LEARNED, LEARNED_FAST = "given", "learned", "learned_fast"
-CHOICES = (GIVEN, LEARNED)  # of exposures
 # Learning rates of poses at the first and the last iteration: of unit quaternions, and of translations in scene scales.
 POSE_RATES = {
     LEARNED: ((1e-3, 1e-5), (2e-3, 2e-5)),  # do no harm to exact poses
@@ -38,8 +31,6 @@ POSE_RATES = {
 }
 RATE = 3e-3  # of log-gains of exposures; it does not decay, because exposures that freeze early are wrong
 OFFSET_RATE = RATE / 5  # of their offsets, in colours from 0 to 1
-MAP, FISHEYES = "map", "fisheyes_"
-LENSES = (GIVEN, MAP, *(FISHEYES + axis for axis in AXES))
 
 
 @dataclass(frozen=True)
@@ -206,11 +197,8 @@ class Corrections(nn.Module):
         groups += [] if self.poses is None else self.poses.groups(self._options.poses, iterations)
         return groups + ([] if self.lens is None else self.lens.groups(iterations))
 
-    def renderer(self, model: Model) -> Callable[[View], TrainingRender]:
-        """Return a function that renders a training view at its corrected pose and through its lenses."""
-        return model.draw if self.poses is None and self.lens is None else partial(self._draw, model)
-
-    def _draw(self, model: Model, view: View) -> TrainingRender:
+    def draw(self, model: Model, view: View) -> TrainingRender:
+        """Render a training view at its corrected pose and through its lenses."""
         view = view if self.poses is None else self.poses.refined(view)
         if isinstance(self.lens, DualLens):
             return self.lens.draw(model.draw, view)

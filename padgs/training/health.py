@@ -2,8 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -63,17 +62,6 @@ def memory_reason(error: BaseException) -> str:
         size = f"{float(found[1]) / 1e9:.1f} GB" if found[2] == "bytes" else f"{found[1]} {found[2]}"
         return f"{size} more were requested than there are; {way_out}"
     return way_out
-
-
-@contextmanager
-def out_of_memory_as_failure(iteration: int) -> Iterator[None]:
-    """Raise a Failure (oom) instead of errors that mean that memory ran out."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, Failure) or not is_out_of_memory(error):
-            raise
-        raise Failure("oom", f"out of memory at iteration {iteration}: {memory_reason(error)}") from error
 
 
 class Monitor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from padgs.clock import Lap
 from padgs.scene import Scene
 from padgs.training.corrections import Corrections
-from padgs.training.health import EarlyStopping, Failure, Monitor, out_of_memory_as_failure
+from padgs.training.health import EarlyStopping, Failure, Monitor, is_out_of_memory, memory_reason
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget, TrainOptions
@@ -91,9 +91,13 @@ class Trainer:
             expected = min(self.durations, default=0.0)
             step = budget.next_step(self.step, self.spent, expected, skipped=self.skipped, began=self.began)
             self._monitor.begin(step, self._views.halvings(step / self.schedule), iteration)
-            with out_of_memory_as_failure(iteration):
+            try:
                 loss, sizes = self._gradients(iteration, step)
                 events = self._update(iteration, step)
+            except (MemoryError, RuntimeError) as error:
+                if isinstance(error, Failure) or not is_out_of_memory(error):
+                    raise
+                raise Failure("oom", f"out of memory at iteration {iteration}: {memory_reason(error)}") from error
             counts = self._model.counts()
             if isinstance(loss, float):
                 self._monitor.loss(loss, iteration)
@@ -136,7 +140,7 @@ class Trainer:
                 index, view, target = self._views.next(step / self.schedule)
             room -= view.sphere_share
             with stage("draw"):
-                rendered = self.corrections.renderer(model)(view)
+                rendered = self.corrections.draw(model, view)
                 image = self.corrections.exposed(rendered.rendering.image, index)
             if len(rendered.gaussians) == 0:
                 optimizer.refuse_non_finite(optimizer.parameters(), iteration)  # NaN parameters draw nothing either

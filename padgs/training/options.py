@@ -4,10 +4,13 @@ import math
 from dataclasses import dataclass
 
 from padgs.checks import check, check_known
-from padgs.training.corrections import CHOICES, GIVEN, LENSES, POSE_RATES
+from padgs.geometry.lens import AXES
 from padgs.training.loss import DEPTH_KINDS, NORMALISATIONS, ROW_WEIGHTS
 from padgs.training.schedule import LEARNING_RATES
 
+GIVEN, LEARNED, LEARNED_FAST = "given", "learned", "learned_fast"  # corrections of the views
+MAP, FISHEYES = "map", "fisheyes_"  # cameras of all panoramas
+LENSES = (GIVEN, MAP, *(FISHEYES + axis for axis in AXES))
 AUTO = "auto"  # number of Gaussians or iterations as needed
 CLOCKS = ("wall", "cpu")  # cpu: summed over all threads; other programs change it less
 
@@ -99,9 +102,9 @@ class TrainOptions:
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
         check(self, "in [0, 1)", lambda decay: 0 <= decay < 1, "adam_beta2")
-        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES, depth_kind=DEPTH_KINDS)
+        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, depth_kind=DEPTH_KINDS)
         check(self, ">= 0 and finite", lambda weight: 0 <= weight < math.inf, "depth_weight", "square_weight")
-        check_known(self, poses=(GIVEN, *POSE_RATES), lens=LENSES)
+        check_known(self, poses=(GIVEN, LEARNED, LEARNED_FAST), exposures=(GIVEN, LEARNED), lens=LENSES)
         if isinstance(self.learning_rates, str):
             check_known(self, learning_rates=LEARNING_RATES)
         else:

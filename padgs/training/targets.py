@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,9 +16,7 @@ from padgs.geometry.panorama import Device
 from padgs.scene import Scene, View
 from padgs.training import loss as losses
 from padgs.training.model import State
-
-if TYPE_CHECKING:
-    from padgs.training.options import TrainOptions
+from padgs.training.options import TrainOptions
 
 CACHE_BYTES = 1 << 29  # weights of views beyond this are computed again at every iteration
 SLACK = 0.01  # of the sphere, by which photographs may show more than a panorama in one iteration

@@ -2,11 +2,12 @@
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property, wraps
+from functools import cached_property
 from textwrap import wrap
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,6 @@ from PIL import Image
 
 from padgs.reports.methods import METHODS, color, method_of
 
-P = ParamSpec("P")
-T = TypeVar("T")
 OTHERS = ("#44aa99", "#999933", "#882255")
 INK, SOFT, GRID, PAPER = "#1d2330", "#5b6475", "#e3e6eb", "#ffffff"
 COLORS = (*(method["color"] for method in METHODS.values()), *OTHERS)
@@ -95,17 +94,13 @@ class Chart:
         return text.getvalue()
 
 
-def styled(draw: Callable[P, T]) -> Callable[P, T]:
-    """Run a drawing function with `STYLE`, which matplotlib reads whenever something is added to a figure."""
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw with `STYLE`, which matplotlib reads whenever something is added to a figure; a decorator."""
+    from matplotlib import rc_context
 
-    @wraps(draw)
-    def in_style(*arguments: P.args, **named: P.kwargs) -> T:
-        from matplotlib import rc_context
-
-        with rc_context(STYLE):
-            return draw(*arguments, **named)
-
-    return in_style
+    with rc_context(STYLE):
+        yield
 
 
 def figure(columns: int, rows: int, width: float = 3.0, height: float = 2.6) -> tuple[Any, Any]:

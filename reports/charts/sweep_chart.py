@@ -12,7 +12,7 @@ from padgs.reports import REPORTS, methods
 from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, set_axis, spans, styled
 from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
 from padgs.reports.frame import by_place, grouped
-from padgs.reports.measures import Measure, costs, metrics, quantity
+from padgs.reports.measures import COSTS, Measure, metrics, quantity
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, Setting, experiment_of, is_number, one_setting, settings, sort_key
 from padgs.reports.significance import over_seeds
@@ -111,7 +111,7 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
     return found
 
 
-@styled
+@styled()
 def chart(sweep: Sweep) -> Chart:
     """Return a panel for each quantity; a dotted line marks the paper's value."""
     if not sweep.key:  # several keys share an axis of texts
@@ -134,7 +134,7 @@ def chart(sweep: Sweep) -> Chart:
 def _measures(request: Request, runs: DataFrame) -> tuple[Measure, ...]:
     if request.metrics:
         return tuple(quantity(name, request.protocol, runs) for name in request.metrics)
-    usual = (*metrics(request.protocol), *costs(*SHOWN_COSTS))
+    usual = (*metrics(request.protocol), *(COSTS[name] for name in SHOWN_COSTS))
     return tuple(measure for measure in usual if measure.name in runs and runs[measure.name].notna().any())
 
 

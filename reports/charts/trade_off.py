@@ -11,14 +11,14 @@ from padgs.files import file_name
 from padgs.reports import methods, published
 from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, sheets
 from padgs.reports.frame import by_place, without_data
-from padgs.reports.measures import PROTOCOL_METRICS, Measure, costs, metric
+from padgs.reports.measures import COSTS, PROTOCOL_METRICS, Measure, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, one_setting, settings
-from padgs.reports.significance import failure_notes, over_scenes
+from padgs.reports.significance import failures, over_scenes
 from padgs.reports.table import Cell
 
 FEWEST = 3  # methods in a chart of equal time
-COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
+SHOWN_COSTS = [COSTS[name] for name in ("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")]
 QUALITIES = tuple(metric(of, PROTOCOL_METRICS[of][name]) for of in ("sphere", "paper") for name in ("psnr", "lpips"))
 
 
@@ -138,7 +138,7 @@ def _is_release(preset: str) -> bool:
 
 
 def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
-    measures = (*(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/")), *COSTS)
+    measures = (*(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/")), *SHOWN_COSTS)
     every = settings(pd.concat(group.values()))
     for setting in every:
         refuse_mixture(setting.runs, request, f"{name}, {setting.title}", OF_A_MEAN)
@@ -157,7 +157,9 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) ->
         named = ", ".join(place.scene for place in finished)
         what = f"{what}, mean over its scenes {named}" if what else f"mean over {named}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
-    notes = footnotes({what: shown}, request.protocol) + failure_notes(every)
+    failed = [f"{one.title} ({words.upper()})" for one in every if (words := failures(one.runs))]
+    notes = footnotes({what: shown}, request.protocol)
+    notes += [f"Failed runs are left out: {'; '.join(failed)}."] if failed else []
     return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes))
 
 

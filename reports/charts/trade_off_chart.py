@@ -44,14 +44,9 @@ class Mark:
     y: float  # quality
 
     @property
-    def area(self) -> float:
-        """Points^2."""
-        return SMALL_AREA if self.role == "release" else AREA
-
-    @property
     def radius(self) -> float:
         """Points."""
-        return math.sqrt(self.area) / 2
+        return math.sqrt(SMALL_AREA if self.role == "release" else AREA) / 2
 
 
 def charts(run_set: RunSet) -> list[Chart]:
@@ -76,7 +71,7 @@ def chart(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> Chart:
     return Chart(trade_off.name, trade_off.title, made, notes, trade_off.numbers)
 
 
-@styled
+@styled()
 def draw(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> tuple[Any, list[tuple[Any, list[Mark], str, list[Any]]]]:
     """Return the figure, and for each panel the axes, the marks, the unit of the cost and the labels."""
     quality = trade_off.quality
@@ -102,7 +97,7 @@ def draw(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> tuple[Any, list[tup
     return made, [(panel, own, unit, _label(panel, own)) for panel, own, unit in panels]
 
 
-@styled
+@styled()
 def time_chart(trade_off: TradeOff) -> Chart | None:
     """Return held-out PSNR over training seconds, with a label where a run ends; None if no run has a log.
 
@@ -238,15 +233,13 @@ def _draw(panel: Any, trade_off: TradeOff, mark: Mark, cost: str, presets: Seque
     else:
         ours = weight_of(mark.point.preset, mark.role) == "bold"
         look |= {"facecolors": color, "edgecolors": INK if ours else drawing.PAPER, "linewidths": 1.2 if ours else 0.5}
-    panel.scatter(mark.x, mark.y, s=mark.area, **look)
+    panel.scatter(mark.x, mark.y, s=(2 * mark.radius) ** 2, **look)
 
 
 def _draw_front(panel: Any, points: Sequence[tuple[float, float]]) -> None:
-    corners = pareto(points)
-    corners += [(max(panel.get_xlim()[1], corners[-1][0]), corners[-1][1])] if corners else []
-    steps = [*corners[:1], *(at for (_, y), (x, top) in pairwise(corners) for at in ((x, y), (x, top)))]
-    if steps:
-        panel.plot(*zip(*steps, strict=True), color=SOFT, linewidth=0.9, zorder=1.5)
+    if corners := pareto(points):
+        corners.append((max(panel.get_xlim()[1], corners[-1][0]), corners[-1][1]))
+        panel.step(*zip(*corners, strict=True), where="post", color=SOFT, linewidth=0.9, zorder=1.5)
 
 
 def _label(panel: Any, marks: Sequence[Mark]) -> list[Any]:

@@ -26,7 +26,7 @@ def times_seen(method: Cubemap3DGSMethod) -> torch.Tensor:
     """How many views hold each direction of a panorama, [H, W]."""
     lens = method.lens(PANORAMA)
     tangent = lens.width / 2 / lens.fx
-    x, y, z = torch.einsum("kij,hwj->khwi", method.turns(), PANORAMA.rays(dtype=torch.float64)).unbind(-1)
+    x, y, z = torch.einsum("kij,hwj->khwi", method.TURNS, PANORAMA.rays(dtype=torch.float64)).unbind(-1)
     return ((z > 0) & (x.abs() <= tangent * z) & (y.abs() <= tangent * z)).sum(0)
 
 

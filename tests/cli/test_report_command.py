@@ -135,11 +135,6 @@ def test_a_missing_folder_is_refused(tmp_path):
     assert done.exit_code == 1 and "there is no folder" in done.output
 
 
-def test_reports_need_no_torch(root):
-    code = "import sys, padgs.reports.writers; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
-
-
 def test_help_is_quick(root):
     code = "import sys, padgs.cli.commands; sys.exit('torch' in sys.modules or 'hydra' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0

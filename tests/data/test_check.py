@@ -39,7 +39,11 @@ def test_valid_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "up", "off_axis", "tilt", "reprojection"),
-    [("flat", "-y", 34.7, 0.3, 0.20), ("garden", "-y", 34.9, 2.1, 0.26), ("room", "+z", 0.0, 0.0, None)],
+    [
+        ("flat", "-y", 34.7, 0.3, 0.20),
+        pytest.param("garden", "-y", 34.9, 2.1, 0.26, marks=pytest.mark.slow),
+        ("room", "+z", 0.0, 0.0, None),
+    ],
 )
 def test_real_data_sets_pass(
     name: str, up: str, off_axis: float, tilt: float, reprojection: float | None, shared: Path

@@ -34,7 +34,7 @@ run.main()
 """
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("delay", [0.0, pytest.param(0.2, marks=pytest.mark.slow), 1.0])
 def test_ctrl_c_is_answered_while_the_program_starts(delay):
     settings = ["train.iterations=20000" if one.startswith("train.iterations") else one for one in TINY]
     command = [sys.executable, "-c", ANNOUNCED, *settings]
@@ -120,7 +120,8 @@ def test_a_missing_data_set_says_where_to_get_it_and_where_to_put_it(start, tmp_
     assert error.count("error:") == 1 and "Traceback" not in error
 
 
-@pytest.mark.parametrize("arguments", [[], pytest.param(["+sweep=seeds"], marks=pytest.mark.slow)])
+@pytest.mark.slow  # a process each; `tests/runs/test_run.py` has the same in one
+@pytest.mark.parametrize("arguments", [[], ["+sweep=seeds"]])
 def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, arguments):
     (tmp_path / "runs").write_text("a file where the folder should be")
     code, _, error = finish(start(*TINY, *arguments))

@@ -26,10 +26,14 @@ def test_repeated_backward_is_equal(backend: str, options: RenderOptions, genera
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list:
     """Collect the cores that forward passes on the CPU keep."""
-    found, allocate = [], cpu_backend._Cores.allocate
-    monkeypatch.setattr(
-        cpu_backend._Cores, "allocate", lambda *arguments: found.append(allocate(*arguments)) or found[-1]
-    )
+    found, draw = [], cpu_backend._Image.draw
+
+    def drawn(image, *arguments, **options):
+        pixels = draw(image, *arguments, **options)
+        found.extend(image._cores)
+        return pixels
+
+    monkeypatch.setattr(cpu_backend._Image, "draw", drawn)
     return found
 
 
@@ -44,7 +48,8 @@ def test_kept_cores_fit_their_buffer(size: int, kept: list, generator: torch.Gen
     for few in (5, count):
         part = Gaussians(*(value[:few] for value in vars(inputs).values()))
         render(part, view, options_of("ray", size, low_pass=0.0), backend="cpu").image.sum().backward()
-        used, room = int(kept[-1].start[-1]), len(kept[-1].words)
+        words, start = kept[-1]
+        used, room = int(start[-1]), len(words)
         patches = 8 * 15
         assert 98 * patches < used <= room <= patches * (98 + min(17 * few, 32 * size))
         assert few < count or used > patches * (98 + 12)  # in words: a third of the room where the core is one

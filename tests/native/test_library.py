@@ -36,6 +36,7 @@ def in_a_new_process(code: str, *arguments: str, **environment: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow  # a process
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs /proc to see what is loaded")
 def test_importing_loads_no_library():
     code = """

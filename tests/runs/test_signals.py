@@ -147,7 +147,10 @@ main()
 
 
 @pytest.mark.parametrize("program", ["padgs.multirun.run", pytest.param("padgs.cli.app", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("error", ["error", "ImportError('an extension module could not be loaded')"])
+@pytest.mark.parametrize(
+    "error",
+    [pytest.param("error", marks=pytest.mark.slow), "ImportError('an extension module could not be loaded')"],
+)
 def test_a_stop_while_extensions_are_imported_is_a_stop(root, program, error):
     command = [sys.executable, "-c", CUT.format(error=error, program=program), "smallest", "nowhere"]
     command[3:] = [] if program == "padgs.multirun.run" else command[3:]

@@ -10,7 +10,7 @@ from padgs.runs import run as pipeline
 from padgs.runs.store import RunStore
 
 ITERATIONS = 12
-SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")
+SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none")
 
 
 def run(config) -> tuple[results.Result, str]:

@@ -66,20 +66,17 @@ class BenchOptions:
 QUICK = BenchOptions(sizes=("quick",), repeats=3, ceiling_seconds=0.05)
 
 
-def measure_all(
-    options: BenchOptions, progress: Callable[[str], None] = lambda _: None, file: Path | None = None
-) -> dict[str, Any]:
+def measure_all(options: BenchOptions, file: Path, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Measure and return the report described above.
 
-    `progress` is called with what is being measured. The report is written to `file`, if given, after each size, too:
+    `progress` is called with what is being measured. The report is written to `file` after each size, too:
     a time limit then loses little. Raises OSError without the native library, and ValueError without the GPU.
     """
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/renderer.md")
-    if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        check_place(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    check_place(file)
     with clock.threads(options.threads or clock.machine()["cores"]):
         progress("the ceilings of this machine")
         ceilings = measure_ceilings(device, options.ceiling_seconds)
@@ -103,9 +100,8 @@ def measure_all(
     return report
 
 
-def _write(report: dict[str, Any], file: Path | None) -> None:
-    if file is not None:
-        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
+def _write(report: dict[str, Any], file: Path) -> None:
+    write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
 
 
 def measure_size(size: Size, options: BenchOptions, device: torch.device) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from padgs.geometry import harmonics
 from padgs.geometry.similarity import Similarity
 from padgs.methods.anchors.method import AnchorModel
 from padgs.methods.splats.model import SplatModel
-from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
+from padgs.methods.splats.smoothing_filter import cameras_of, finest_pixels, widened
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering, render
 from padgs.runs.load import LoadedRun
@@ -65,7 +65,8 @@ def export_run(
             splats = transform_splats(splats, world.inverse())
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             # Square pixels, also after training with several samples: for viewers with one, this is nearer to the run.
-            splats, smooth = smoothed(splats, cameras_of(run.scene.train), config.low_pass), False
+            pixels = finest_pixels(splats.means, cameras_of(run.scene.train))
+            splats, smooth = widened(splats, config.low_pass * pixels.square()), False
             as_trained += ", including the 3D smoothing filter"
         notes.append(as_trained)
         if distillation_steps != DISTILLATION_STEPS and not config.steepness:

@@ -146,10 +146,8 @@ def free_port(host: str, first: int) -> int:
     reason = f"the ports from {first} on are taken"
     for port in range(first, min(first + PORTS_TRIED, 65536)):
         try:
-            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-            with socket.socket(family, kind) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
+            family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            socket.create_server(address, family=family).close()  # with SO_REUSEADDR
             return port
         except (OSError, UnicodeError) as error:
             if getattr(error, "errno", None) not in (errno.EADDRINUSE, errno.EACCES):

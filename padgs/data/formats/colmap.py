@@ -55,11 +55,11 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     if model is None:
         raise DataError(f"{path} holds no COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0)")
     files = {name: file for name in model_files.FILES if (file := model_files.find_file(model, name))}
-    points, colored = model_files.Points({}, None), None
+    row_of, cloud, colored = dict[int, int](), None, None
     with forgiving(options.points):
-        points = model_files.read_points(files["points3D"]) if "points3D" in files else points
-    if not points.row_of and (colored := first_ply(model, PLY, options.points)):
-        points = model_files.Points({}, colored)
+        row_of, cloud = model_files.read_points(files["points3D"]) if "points3D" in files else ({}, None)
+    if not row_of and (colored := first_ply(model, PLY, options.points)):
+        cloud = colored
     needed = model_files.FILES if colored is None and options.points == "auto" else model_files.FILES[:2]
     if absent := [name for name in needed if name not in files]:
         raise DataError(
@@ -73,8 +73,8 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     where = str(files["images"])
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model, where) for image in images)
     notes = _file_notes(path, model, files, colored is not None)
-    tracks = partial(_tracks, images, points.row_of)
-    return Capture("colmap", path, folder, frames, points.cloud, tracks=tracks, notes=tuple(notes))
+    tracks = partial(_tracks, images, row_of)
+    return Capture("colmap", path, folder, frames, cloud, tracks=tracks, notes=tuple(notes))
 
 
 def pose_of(image: model_files.Image, where: str) -> Tensor:

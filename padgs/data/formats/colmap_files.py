@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -48,13 +48,6 @@ class Image:
     name: str
     pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))  # [K, 2] observations
     points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [K] their point ids
-
-
-class Points(NamedTuple):
-    """The points file."""
-
-    row_of: dict[int, int]  # point id -> row of the cloud
-    cloud: Cloud | None
 
 
 def find_file(model: Path, stem: str) -> Path | None:
@@ -117,8 +110,8 @@ def read_images(file: Path) -> Iterator[Image]:
     yield from _entries(file, entry)
 
 
-def read_points(file: Path) -> Points:
-    """Read the points file."""
+def read_points(file: Path) -> tuple[dict[int, int], Cloud]:
+    """Read the points file: point id -> row of the cloud, and the cloud."""
     if file.suffix.lower() == ".txt":
         kinds, rows = (int, *[float] * 6), []
         for number, line in _lines(file):
@@ -135,7 +128,7 @@ def read_points(file: Path) -> Points:
     values = np.array([row[1:] for row in rows], np.float64).reshape(-1, 6)
     colors = color_bytes(whole_if_possible(values[:, 3:]), str(file))
     cloud = Cloud(torch.from_numpy(values[:, :3].copy()), colors)
-    return Points({row[0]: i for i, row in enumerate(rows)}, cloud)
+    return {row[0]: i for i, row in enumerate(rows)}, cloud
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:

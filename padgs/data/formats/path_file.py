@@ -6,6 +6,7 @@ right, y up, z backward) in a normalised world, which the run's `dataparser_tran
 beside the path.
 """
 
+import math
 import warnings
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from torch import Tensor
 from padgs.data.camera_paths import PATHS, interpolate_poses, look_along
 from padgs.data.capture import FARTHEST, DataError
 from padgs.data.formats.json_file import Json, read_json
-from padgs.data.formats.poses import OPENCV_FROM_OPENGL, cam_from_pose, rigid
+from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose, rigid
+from padgs.geometry.similarity import Similarity
 
 MAX_FRAMES = 100_000  # longer videos fill the memory
 TRANSFORMS = "dataparser_transforms.json"
@@ -70,9 +72,9 @@ def _keyframe(entry: Json, up: Tensor) -> Tensor:
 
 
 def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -> list[Tensor]:
-    scale, transform = 1.0, torch.eye(4, dtype=torch.float64)
+    world = Similarity()
     if transforms.is_file():
-        scale, transform = nerfstudio_world(transforms, transforms_json)
+        world = nerfstudio_world(transforms, transforms_json)
     else:
         where = f"there is no {transforms.name} beside the camera path"
         warnings.warn(f"{where}: it is taken to be in the world of the data set; copy it from the run", stacklevel=2)
@@ -81,25 +83,27 @@ def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -
         warnings.warn("the fields of view of the camera path are not used; set --camera and --fov", stacklevel=2)
     for entry in cameras.entries():
         stated = entry["camera_to_world"]
-        world_from_cam = stated.numbers()
-        if world_from_cam.numel() != 16:
-            raise DataError(f"{stated.where} has {world_from_cam.numel()} numbers; a pose has 16")
-        world_from_cam = world_from_cam.reshape(4, 4)
-        world_from_cam[:3, 3] = transform[:3, :3].T @ (world_from_cam[:3, 3] / scale - transform[:3, 3])
-        world_from_cam[:3, :3] = transform[:3, :3].T @ world_from_cam[:3, :3] @ OPENCV_FROM_OPENGL
-        poses.append(cam_from_pose(world_from_cam, stated.where))
+        matrix = stated.numbers()
+        if matrix.numel() != 16:
+            raise DataError(f"{stated.where} has {matrix.numel()} numbers; a pose has 16")
+        poses.append(world.pose(cam_from_opengl_pose(matrix.reshape(4, 4), stated.where)))
     return poses
 
 
-def nerfstudio_world(normalized: Path, transforms_json: Path | None) -> tuple[float, Tensor]:
-    """Return s and T [4, 4]: nerfstudio's world is s (T @ x) for x in the data set's; a DataError without them."""
+def nerfstudio_world(normalized: Path, transforms_json: Path | None) -> Similarity:
+    """Return data_from_nerfstudio, where nerfstudio's world is s (T @ x) for x in the data set's; a DataError without
+    them.
+    """
     values = read_json(normalized)  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
     applied = Json({}, "") if transforms_json is None else read_json(transforms_json)
     before, factor = applied.get("applied_transform"), applied.get("applied_scale")
     transform = _homogeneous(values["transform"])
     if before:
         transform = transform @ torch.linalg.inv(_homogeneous(before))
-    return values["scale"].numbers().item() / (factor.numbers().item() if factor else 1.0), transform
+    scale = values["scale"].numbers().item() / (factor.numbers().item() if factor else 1.0)
+    if not 0 < scale < math.inf:
+        raise DataError(f"{values['scale'].where} makes a scale of {scale:g}; it must be above 0")
+    return Similarity(scale, transform[:3, :3], scale * transform[:3, 3]).inverse()
 
 
 def _homogeneous(rows: Json) -> Tensor:

@@ -69,7 +69,7 @@ def read_ricoh360(path: Path, options: DataOptions) -> Capture:
     cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"), options.points)
     if cloud is None and (model / "points3D.txt").is_file():
         with forgiving(options.points):
-            cloud = read_points(model / "points3D.txt").cloud
+            cloud = read_points(model / "points3D.txt")[1]
     return Capture("ricoh360", path, images, tuple(frames), cloud)
 
 

@@ -55,8 +55,8 @@ def write_colmap(content: Content, folder: Path) -> None:
     _write_lists(content, folder)
 
 
-def write_transforms(content: Content, folder: Path) -> None:
-    """Write `transforms.json` and sparse_pc.ply."""
+def write_transforms(content: Content, folder: Path, **more: Any) -> None:
+    """Write `transforms.json`, with `more` keys, and sparse_pc.ply."""
     frames = []
     for frame in content.frames:
         pose = torch.linalg.inv(frame.cam_from_world)
@@ -64,7 +64,7 @@ def write_transforms(content: Content, folder: Path) -> None:
         frame_size = {} if frame.width is None else {"w": frame.width, "h": frame.height}
         frame_size |= {"share": frame.share} if frame.share != 1 else {}
         frames.append({"file_path": f"images/{frame.name}", **frame_size, "transform_matrix": pose.tolist()})
-    meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
+    meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames, **more}
     if content.cloud is not None:
         write_ply(folder / "sparse_pc.ply", content.cloud)
         meta["ply_file_path"] = "sparse_pc.ply"

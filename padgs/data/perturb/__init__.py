@@ -44,5 +44,6 @@ class StressOptions:
             return scene
         condition = CONDITIONS[self.condition]
         random = np.random.default_rng((seed, zlib.crc32(self.condition.encode())))
-        scene = condition.change(scene, condition.levels[self.level - 1], random)
-        return replace(scene, notes=(*scene.notes, f"stress: {condition.describe(self.level)}"))
+        value = condition.levels[self.level - 1]
+        scene = condition.change(scene, value, random)
+        return replace(scene, notes=(*scene.notes, f"stress: {condition.text.format(value)}"))

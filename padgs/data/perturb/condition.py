@@ -25,10 +25,6 @@ class Condition:
     allowed: tuple[float, ...] = ()
     metric: str = "ws_psnr"
 
-    def describe(self, level: int) -> str:
-        """Return what the condition does at a level from 1 on."""
-        return self.text.format(self.levels[level - 1])
-
     def row(self) -> tuple[str, ...]:
         """Return the cells of the docs' table: the text with a gap for the value, and the values of all levels."""
         (field,) = re.findall(r"{.*?}", self.text)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.perturb.condition import condition
-from padgs.scene import Scene, View
+from padgs.scene import Scene, View, move_origin
 
 DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # horizontal; a rotation about it moves both the y and the z axis
 MIN_POINTS = 8  # explicit Gaussians take their first size from their three nearest neighbors
@@ -52,7 +52,7 @@ def world_scale(scene: Scene, factor: float, random: np.random.Generator) -> Sce
 def world_offset(scene: Scene, distance: float, random: np.random.Generator) -> Scene:
     """Move the world `distance` scene scales away from its origin, like georeferenced captures; points in float64."""
     offset = distance * scene.scale * torch.tensor(DIAGONAL, dtype=torch.float64)
-    scene = scene.with_views(lambda view: _shift(view, offset))
+    scene = scene.with_views(lambda view: replace(view, cam_from_world=move_origin(view.cam_from_world, -offset)))
     return replace(scene, points=scene.points.double() + offset.to(scene.points.device))
 
 
@@ -62,9 +62,9 @@ def pose_noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene
 
     def move(view: View) -> View:
         offset = torch.from_numpy(random.standard_normal(3)).to(view.cam_from_world)
-        return _shift(view, sigma * scene.scale * offset)
+        return replace(view, cam_from_world=move_origin(view.cam_from_world, -sigma * scene.scale * offset))
 
-    return change_training_views(scene, move)
+    return replace(scene, train=tuple(map(move, scene.train)))
 
 
 @condition("training cameras are rotated by {}°", 0.05, 0.2, 1.0, allowed=(0.5, 3.0, 8.0))
@@ -75,7 +75,7 @@ def pose_rotation(scene: Scene, sigma: float, random: np.random.Generator) -> Sc
         axis, size = random.standard_normal(3), random.standard_normal()
         return rotate_camera(view, rotation_about(axis / np.linalg.norm(axis) * sigma * size))
 
-    return change_training_views(scene, move)
+    return replace(scene, train=tuple(map(move, scene.train)))
 
 
 @condition("one of {} training views is left", 2, 4, 8)
@@ -131,11 +131,6 @@ def near_points(scene: Scene, share: float, random: np.random.Generator) -> Scen
     return _move_points(scene, share, sample, random)
 
 
-def change_training_views(scene: Scene, change: Callable[[View], View]) -> Scene:
-    """Return the scene with all training views changed."""
-    return replace(scene, train=tuple(map(change, scene.train)))
-
-
 def rotation_about(vector: Sequence[float] | np.ndarray) -> Tensor:
     """Return the rotation [3, 3] float64 about a vector [3] by its length in degrees."""
     from scipy.spatial.transform import Rotation
@@ -147,13 +142,6 @@ def rotate_camera(view: View, rotation: Tensor) -> View:
     """Return the view with its camera frame rotated by a matrix [3, 3] about its own center."""
     pose = view.cam_from_world.clone()
     pose[:3] = rotation.to(pose) @ pose[:3]
-    return replace(view, cam_from_world=pose)
-
-
-def _shift(view: View, offset: Tensor) -> View:
-    """Return the view with its camera moved by an offset [3] in the world frame."""
-    pose = view.cam_from_world.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset.to(pose)
     return replace(view, cam_from_world=pose)
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.perturb.condition import condition
-from padgs.data.perturb.geometry import change_training_views, rotate_camera, rotation_about
+from padgs.data.perturb.geometry import rotate_camera, rotation_about
 from padgs.files import open_image
 from padgs.geometry.panorama import pad_panorama, project, rays, sample, sample_bicubic
 from padgs.scene import Scene, View
@@ -113,7 +113,7 @@ def exposure(scene: Scene, doublings: float, random: np.random.Generator) -> Sce
         factor = 2 ** random.uniform(-doublings, doublings)
         return change_pixels(view, lambda pixels: _to_bytes(pixels.float() * factor))
 
-    return change_training_views(scene, expose)
+    return replace(scene, train=tuple(map(expose, scene.train)))
 
 
 @condition("a person, different in each training view, hides the lowest {:.0%} of the rows", 0.03, 0.06, 0.15)
@@ -130,7 +130,7 @@ def nadir(scene: Scene, share: float, random: np.random.Generator) -> Scene:
 
         return change_pixels(_panorama(view), stand)
 
-    return change_training_views(scene, hide)
+    return replace(scene, train=tuple(map(hide, scene.train)))
 
 
 @condition("training views are JPEGs of quality {}", 90, 70, 40)
@@ -142,7 +142,7 @@ def jpeg(scene: Scene, quality: int, random: np.random.Generator) -> Scene:
         Image.fromarray(pixels.cpu().numpy()).save(file, "JPEG", quality=quality)
         return torch.from_numpy(np.array(open_image(file))).to(pixels.device)
 
-    return change_training_views(scene, lambda view: change_pixels(view, compress))
+    return replace(scene, train=tuple(change_pixels(view, compress) for view in scene.train))
 
 
 @condition("training views have Gaussian noise with a standard deviation of {:.0%} of white", 0.02, 0.05, 0.1)
@@ -158,7 +158,7 @@ def noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
 
         return change_pixels(view, add)
 
-    return change_training_views(scene, spoil)
+    return replace(scene, train=tuple(map(spoil, scene.train)))
 
 
 @condition("training views have 1/{} of the width and height", 2, 4, 8, allowed=(2.0,))
@@ -180,7 +180,7 @@ def resolution(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
         changed = change_pixels(_panorama(view), pool, pool_mask, lambda depth: depth[middle, middle])
         return replace(changed, width=view.width // factor, height=view.height // factor)
 
-    return change_training_views(scene, shrink)
+    return replace(scene, train=tuple(map(shrink, scene.train)))
 
 
 def change_pixels(

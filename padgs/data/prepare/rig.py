@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from padgs.data.capture import Cloud, Frame, Progress, Tracks
 from padgs.data.formats.colmap_lens import pycolmap_module
 from padgs.data.formats.poses import rigid
-from padgs.data.images import decode
+from padgs.data.images import decode, save_png
 from padgs.data.perspectives import looking_at
 from padgs.geometry.camera import Pinhole
 from padgs.geometry.panorama import direction, project, sample
@@ -39,11 +38,6 @@ def view_lens(pano_width: int) -> Pinhole:
     return Pinhole(size, size, size / 2, size / 2, size / 2, size / 2)
 
 
-def owned(index: int, rays: Tensor) -> Tensor:
-    """Return whether directions [..., 3] in the panorama's frame belong to view `index`: bool [...]."""
-    return (rays @ cam_from_pano()[:, 2].mT).argmax(-1) == index
-
-
 def render_views(
     images: dict[str, Path], masks: dict[str, Path], folder: Path, mask_folder: Path, progress: Progress
 ) -> None:
@@ -58,11 +52,11 @@ def render_views(
         rays = view_lens(image.shape[1]).rays(dtype=torch.float64)
         for index, rotation in enumerate(rotations):
             pano_rays = rays @ rotation  # R^T d: from the view's frame to the panorama's
-            use = owned(index, pano_rays)
+            use = (pano_rays @ rotations[:, 2].mT).argmax(-1) == index  # each direction belongs to one view
             if mask is not None:
                 use &= sample(mask, pano_rays)[..., 0].round() >= 128
-            _save(sample(image, pano_rays).round().byte().numpy(), folder / view_name(index, name))
-            _save((use.numpy() * np.uint8(255)), mask_folder / f"{view_name(index, name)}.png")
+            save_png(sample(image, pano_rays), folder / view_name(index, name), compress_level=1)
+            save_png(use.byte() * 255, mask_folder / f"{view_name(index, name)}.png", compress_level=1)
         progress(done + 1, len(images))
 
 
@@ -116,8 +110,3 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
         pixels=torch.cat([pixels for _, _, pixels in seen]),
     )
     return frames, cloud, tracks
-
-
-def _save(pixels: np.ndarray, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path, compress_level=1)

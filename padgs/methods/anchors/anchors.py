@@ -22,8 +22,6 @@ from padgs.scene import Scene, View
 from padgs.training.initial_points import refuse_unusable, squared_spacing
 from padgs.training.optimizer import load_rows
 
-OMEGA_INPUTS = ("sin2", "cos")
-DISTANCE_UNITS = ("scene", "world")
 MOST_CELLS = 2**53  # from the origin; float64, which rounds positions to cells, counts so far
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
 
@@ -46,7 +44,7 @@ class PaDGSOptions:
     voxel_pixels: float = 0.1  # voxel_size=auto: pixels at the median depth; below 1 like the paper's voxels
 
     def __post_init__(self) -> None:
-        check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS, distance_unit=DISTANCE_UNITS)
+        check_known(self, omega_axis=OMEGA_AXES, omega_input=("sin2", "cos"), distance_unit=("scene", "world"))
         check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
         check(self, "in [0, 1]", lambda limit: 0 <= limit <= 1, "max_modulated_omega")
         check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
@@ -125,7 +123,7 @@ class PaDGS(nn.Module):
     @classmethod
     def from_scene(cls, scene: Scene, options: PaDGSOptions = PaDGSOptions(), *, seed: int = 0) -> PaDGS:
         """Return the untrained model of a scene: its point cloud on a grid."""
-        automatic = automatic_voxel_size(scene, options.voxel_pixels)
+        automatic = options.voxel_pixels * math.pi / max(view.height for view in scene.panoramas) * scene.scale
         voxel_size = automatic if options.voxel_size == "auto" else float(options.voxel_size)
         positions = anchors_from_points(scene.points, voxel_size)
         in_world = options.distance_unit == "world"
@@ -173,14 +171,6 @@ class PaDGS(nn.Module):
 
     def decode(self, view: View, capacity: int | None = None) -> Decoded:
         """Decode the Gaussians that a view sees (Eq. 13-15); `capacity` as in `decode_gaussians`."""
-        weights, seen = self.decoder.weights(), self.seen_anchors(view)
-        gaussians, slots, raw_opacities, count = decode_gaussians(weights, seen, capacity)
-        if self.unit != 1:
-            gaussians = replace(gaussians, means=self.unit * gaussians.means, scales=self.unit * gaussians.scales)
-        return Decoded(gaussians, slots, raw_opacities, None if count is None else HostCopy(count))
-
-    def seen_anchors(self, view: View) -> SeenAnchors:
-        """Return the inputs of the decoder for a view, lengths in `unit`."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
         seen = [direction]
@@ -190,19 +180,18 @@ class PaDGS(nn.Module):
             seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
             seen.append(seen_omega[:, None])
         attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
-        seen = torch.cat(seen, dim=-1)
-        return SeenAnchors(self.features, seen, self.positions / self.unit, self.offsets, self.log_scales, attenuation)
+        lengths = (self.positions / self.unit, self.offsets, self.log_scales)
+        inputs = SeenAnchors(self.features, torch.cat(seen, dim=-1), *lengths, attenuation)
+        gaussians, slots, raw_opacities, count = decode_gaussians(self.decoder.weights(), inputs, capacity)
+        if self.unit != 1:
+            gaussians = replace(gaussians, means=self.unit * gaussians.means, scales=self.unit * gaussians.scales)
+        return Decoded(gaussians, slots, raw_opacities, None if count is None else HostCopy(count))
 
 
 def mean_axis(scene: Scene) -> list[float] | None:
     """Return the mean polar axis [3] of the training panoramas, a unit vector in the world; None for opposite ones."""
     mean = torch.stack([view.cam_from_world[1, :3].double() for view in scene.train if view.lens is None]).mean(0)
     return (mean / mean.norm()).tolist() if mean.norm() > 0.1 else None
-
-
-def automatic_voxel_size(scene: Scene, pixels: float) -> float:
-    """Return the voxel size, world units: so many pixels of the training panoramas at median depth."""
-    return pixels * math.pi / max(view.height for view in scene.panoramas) * scene.scale
 
 
 def cells_from_points(points: Tensor, size: float) -> Tensor:

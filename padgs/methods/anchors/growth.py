@@ -65,14 +65,6 @@ class GrowthOptions:
             grow_every=max(min(MIN_GROW_EVERY, self.grow_every), scaled(self.grow_every, iterations)),
         )
 
-    def cell(self, level: int) -> int:
-        """Return the side of a level's grid cells, in voxels."""
-        return self.coarsest // self.refinement**level
-
-    def threshold(self, level: int) -> float:
-        """Return the mean positional gradient that makes a Gaussian a candidate at a level."""
-        return self.gradient_threshold * (self.refinement // 2) ** level
-
 
 @dataclass(frozen=True)
 class NewAnchors:
@@ -195,11 +187,13 @@ def find_new_anchors(
     """
     centers, offsets = model.centers(), model.options.offsets
     anchors = cells_from_points(model.positions, model.voxel_size)  # [A, 3] in voxels
-    found: list[NewAnchors] = []
+    nothing = mean_gradient[:0]
+    found = [NewAnchors(anchors[:0], model.features.detach()[:0], nothing, nothing)]
     for level in range(options.levels):
-        side = options.cell(level)
+        side = options.coarsest // options.refinement**level
+        threshold = options.gradient_threshold * (options.refinement // 2) ** level
         sampled = torch.rand(len(centers), generator=generator).to(centers.device) > 0.5 ** (level + 1)
-        candidates = (sampled & (mean_gradient >= options.threshold(level))).nonzero()[:, 0]
+        candidates = (sampled & (mean_gradient >= threshold)).nonzero()[:, 0]
         cells, inverse = unique_cells(cells_from_points(centers[candidates], side * model.voxel_size))
         taken = torch.cat([anchors, *(new_anchors.cells for new_anchors in found)])
         free = ~occupied(cells, by=cells_from_points(taken, side))
@@ -208,11 +202,8 @@ def find_new_anchors(
             gradients = _largest_per_cell(mean_gradient[candidates], inverse, len(cells))[free]
             sizes = torch.full_like(gradients, side)
             found.append(NewAnchors(cells[free] * side, features, sizes, gradients))
-        if not found:
+        if len(found) == 1:
             break
-    if not found:
-        nothing = anchors[:0]
-        return NewAnchors(nothing, model.features.detach()[:0], mean_gradient[:0], mean_gradient[:0])
     columns = zip(*(vars(new_anchors).values() for new_anchors in found), strict=True)
     return NewAnchors(*map(torch.cat, columns))
 

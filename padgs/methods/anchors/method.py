@@ -23,7 +23,6 @@ from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.options import AUTO, Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS, Constant, LogLinear, ParameterGroup
 
-OFFSET_RATE_UNITS = ("anchor", "world")
 STATED = ("voxel_size", "scene_scale", "unit", "axis")  # attributes of the anchors in a state
 HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
 
@@ -41,7 +40,7 @@ class LearningRates(ExtentOptions):
     covariance_rate: tuple[float, float] = (0.004, 0.004)  # rates of the network of scales and rotations
 
     def __post_init__(self) -> None:
-        check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)
+        check_known(self, offset_rate_unit=("anchor", "world"))
         pairs = ("offset_rate", "opacity_rate", "color_rate", "covariance_rate")
         check(self, "two rates > 0", lambda pair: all(0 < rate < math.inf for rate in pair), *pairs)
         check(self, ">= 0 and finite", lambda rate: 0 <= rate < math.inf, "feature_rate", "log_scale_rate")

@@ -206,7 +206,7 @@ class EgoNeRF(nn.Module):
         first = coarse.expand(len(origins), -1)
         within = coarse.new_full((len(origins), count), 0.5)  # position in each quantile
         if generator is not None:
-            first = grids.jittered(first, torch.rand(first.shape, generator=generator).to(coarse))
+            first = first + grids.interval_lengths(first) * torch.rand(first.shape, generator=generator).to(coarse)
             within = torch.rand(within.shape, generator=generator).to(coarse)
         at = self._at(origins, directions, first)
         weights, _ = grids.visible_shares(self._optical_depths(self.density.coarse(), at, first))

@@ -162,11 +162,6 @@ def _look_up(image: Tensor, chart: Tensor, first: Tensor, second: Tensor | None)
     return values.reshape(components, -1)
 
 
-def jittered(distances: Tensor, random: Tensor) -> Tensor:
-    """Return distances [..., S], each moved by a share `random` [..., S] in [0, 1) of the interval behind it."""
-    return distances + interval_lengths(distances) * random
-
-
 def interval_lengths(distances: Tensor) -> Tensor:
     """Return the length [..., S] of the interval behind each distance [..., S]; the last repeats the one before.
 

@@ -26,9 +26,6 @@ class LocalLengths:
         self._cameras = torch.cat((cameras[:, :3], torch.ones_like(cameras[:, 3:])), dim=1)  # a pixel is the distance
         self.values = torch.zeros(0, 1)
 
-    def __len__(self) -> int:
-        return len(self.values)
-
     def at(self, means: Tensor) -> Tensor:
         """Return the lengths [N] at means [N, 3]."""
         return EXTENT_PER_DISTANCE * finest_pixels(means.detach(), self._cameras)

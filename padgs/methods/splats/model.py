@@ -77,7 +77,7 @@ class SplatModel:
         self._filter = SmoothingFilter(variance, cameras_of(views)) if variance > 0 else None
         parts: dict[str, Any] = {FILTER_VARIANCES: self._filter, LENGTHS: self._lengths}
         self._measured = {name: part for name, part in parts.items() if part is not None}
-        self._follow()
+        self.follow(iterations)
 
     def groups(self) -> list[ParameterGroup]:
         """Return the learning rates of 3DGS; that of the means decays over the run and scales with `length_unit`."""
@@ -161,12 +161,8 @@ class SplatModel:
     def follow(self, iteration: int) -> None:
         """Let filter and lengths follow the means: after rows changed, at least once a round, and at the end."""
         is_due = iteration >= self.iterations or iteration % self.densifier.options.densify_every == 0
-        self._follow(unless=None if is_due else len(self.splats))
-
-    def _follow(self, unless: int | None = None) -> None:
-        """Update filter and lengths, but not those that have as many rows as `unless`."""
         for part in self._measured.values():
-            if len(part) != unless:
+            if is_due or len(part.values) != len(self.splats):
                 part.update(self.splats.means)
 
     def _prune_invisible(self, smooth: SmoothingFilter, optimizer: torch.optim.Adam) -> tuple[str, ...]:
@@ -249,7 +245,7 @@ class SplatModel:
         self.splats.scene_scale = state.values["scene_scale"]
         self._step = self.iterations
         self.densifier.reset_statistics()
-        self._follow()
+        self.follow(self.iterations)
 
     @torch.no_grad()
     def _rendered_opacities(self) -> Tensor:

@@ -61,9 +61,6 @@ class SmoothingFilter:
         self.square_pixels, self.cameras = square_pixels, cameras
         self.values = torch.zeros(0)
 
-    def __len__(self) -> int:
-        return len(self.values)
-
     def update(self, means: Tensor) -> None:
         """Measure the finest pixel at each of the means [N, 3]."""
         self.values = self.square_pixels * finest_pixels(means.detach(), self.cameras).square()
@@ -72,12 +69,6 @@ class SmoothingFilter:
         """Return widened Gaussians; opacity falls as the volume grows."""
         wide, share = widened_scales(gaussians.scales, self.values)
         return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
-
-
-@torch.no_grad()
-def smoothed(splats: Splats, cameras: Tensor, variance: float) -> Splats:
-    """Return splats as wide as a low-pass of `variance` square pixels makes them in the finest of cameras [V, 4]."""
-    return widened(splats, variance * finest_pixels(splats.means, cameras).square())
 
 
 @torch.no_grad()

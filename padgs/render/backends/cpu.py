@@ -7,7 +7,6 @@ own slot for the gradient sums of the backward pass, and the slots of a Gaussian
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -62,22 +61,6 @@ class Projected(native.Strips):
         super().__init__(Strip, native.strip_cuts(self.per_row.tolist(), max_instances))
 
 
-@dataclass
-class _Cores:
-    """Cores of hybrid blending of a strip, kept for the backward pass (csrc/cpu/kept_cores.h)."""
-
-    words: Tensor  # int32, of the largest possible size; the system provides memory only for the used part
-    start: Tensor  # [tiles + 1] int64
-
-    @staticmethod
-    def allocate(strip: Strip, arguments: abi.BlendArguments) -> _Cores:
-        words = cpu.library().padgs_core_words(ctypes.byref(arguments))
-        return _Cores(torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64))
-
-    def join(self, arguments: abi.BlendArguments) -> None:
-        arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
-
-
 class _Image(native.NativeImage):
     @staticmethod
     def check(means: Tensor) -> None:
@@ -97,13 +80,15 @@ class _Image(native.NativeImage):
         pixels = (torch.empty(*size, 3), torch.empty(size), torch.empty(size))
         self._last = torch.empty(size, dtype=torch.int32)  # position of the last contribution to each pixel
         pairs = torch.zeros(2, dtype=torch.int64)
-        self._cores: list[_Cores] = []  # of each strip, if kept
+        self._cores: list[tuple[Tensor, Tensor]] = []  # words and starts of each strip, if kept (csrc/cpu/kept_cores.h)
         for strip in self._projected.strips():
             pair_counts = torch.empty(strip.tiles, 2, dtype=torch.int64)
             arguments = self._blend_arguments(strip, background, pixels, pair_counts)
-            if differentiated and options.blending == "hybrid":
-                self._cores.append(_Cores.allocate(strip, arguments))
-                self._cores[-1].join(arguments)
+            if differentiated and options.blending == "hybrid":  # the system provides memory only for the used part
+                words = cpu.library().padgs_core_words(ctypes.byref(arguments))
+                kept = torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64)
+                self._cores.append(kept)
+                arguments.cores, arguments.core_start = map(pointer, kept)
             cpu.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
         self.counters = {
@@ -121,7 +106,7 @@ class _Image(native.NativeImage):
         for number, strip in enumerate(self._projected.strips()):
             forward = self._blend_arguments(strip, background, pixels, None)
             if self._cores:
-                self._cores[number].join(forward)
+                forward.cores, forward.core_start = map(pointer, self._cores[number])
             sums = torch.empty(len(strip.instances), abi.GRADIENT_SUMS)
             grads = (upstream.image, upstream.transmittance, upstream.depth, sums, upstream.rays)
             arguments = abi.BlendGradientArguments(forward, *map(pointer, grads), upstream.absgrad)

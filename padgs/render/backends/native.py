@@ -181,13 +181,10 @@ class Strips:
 
     def strips(self) -> Iterator[Any]:
         """Yield the strips from top to bottom."""
-        if len(self._cuts) == 2:
-            if self._only is None:
-                self._only = self._make(self, *self._cuts)
-            yield self._only
-            return
         for first, end in zip(self._cuts, self._cuts[1:], strict=False):
-            yield self._make(self, first, end)
+            strip = self._only or self._make(self, first, end)
+            self._only = strip if len(self._cuts) == 2 else None
+            yield strip
 
 
 def strip_cuts(per_row: list[int], max_instances: int) -> list[int]:

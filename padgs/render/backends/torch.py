@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from padgs.geometry.camera import Camera
 from padgs.render import contract
-from padgs.render.contract import Rendering, RenderOptions, Request
+from padgs.render.contract import Rendering, Request
 from padgs.render.projection import Footprints, project
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
@@ -21,14 +21,14 @@ PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 
 def rasterize(request: Request) -> Rendering:
     """Render by brute force: every pixel against every visible Gaussian."""
-    gaussians, camera, options, background = request.gaussians, request.camera, request.options, request.background
+    gaussians, camera = request.gaussians, request.camera
     footprints = project(request)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     order = order[footprints.visible[order]]
     parts = []
-    places = blocks(camera, len(order), background.device)
+    places = blocks(camera, len(order), gaussians.means.device)
     for rows, columns in places:
-        arguments = (footprints, gaussians.colors, background, order, rows, columns, options, request.absgrad)
+        arguments = (footprints, request, order, rows, columns)
         if len(places) > 1 and torch.is_grad_enabled():
             parts.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         else:
@@ -58,22 +58,15 @@ def blocks(camera: Camera, count: int, device: torch.device | str = "cpu") -> li
 
 
 def _blend(
-    footprints: Footprints,
-    colors: Tensor,
-    background: Tensor,
-    order: Tensor,
-    rows: Tensor,
-    columns: Tensor,
-    options: RenderOptions,
-    absgrad: Tensor | None,
+    footprints: Footprints, request: Request, order: Tensor, rows: Tensor, columns: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Return colour [P, 3], transmittance [P], depth [P] and the number of contributing pairs of P pixels (Eq. 4)."""
-    alpha = fragments(footprints, order, rows, columns, absgrad)
+    options, alpha = request.options, fragments(footprints, order, rows, columns, request.absgrad)
     if options.blending == "hybrid":
         weights, transmittance = hybrid_weights(alpha, footprints.distance(order, rows, columns), options.core_size)
     else:
         weights, transmittance = sorted_weights(alpha)
-    color = weights @ colors[order] + transmittance[:, None] * background
+    color = weights @ request.gaussians.colors[order] + transmittance[:, None] * request.background
     coverage = weights.sum(-1)
     covered = coverage > 0
     depth = (weights @ footprints.depths[order]) / torch.where(covered, coverage, torch.ones_like(coverage))

@@ -317,10 +317,11 @@ def test_automatic_voxel_size(scale):
     points = scale * torch.tensor([[0.0, 0.0, 5.0], [0.0, 5.0, 0.0], [-5.0, 0.0, 0.0]])
     view = View("v", torch.eye(4, dtype=torch.float64), 400, 200)
     scene = Scene("s", (view,), (), points, torch.zeros(3, 3, dtype=torch.uint8), "0")
-    expected = pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
-    assert anchors.automatic_voxel_size(scene, 0.25) == expected
+    expected, options = pytest.approx(0.25 * math.pi / 200 * 5.0 * scale), anchors.PaDGSOptions(voxel_pixels=0.25)
+    assert anchors.PaDGS.from_scene(scene, options).voxel_size == expected
     photograph = replace(view, width=3000, height=2000, lens=perspective(3000, 2000, 45.0))
-    assert anchors.automatic_voxel_size(replace(scene, train=(view, photograph)), 0.25) == expected, "of panoramas"
+    mixed = replace(scene, train=(view, photograph))
+    assert anchors.PaDGS.from_scene(mixed, options).voxel_size == expected, "of panoramas"
 
 
 def test_invalid_clouds_are_refused():

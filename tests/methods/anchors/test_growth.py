@@ -62,12 +62,6 @@ def seeds_of(model, gradients, options=PUBLISHED):
     return [tuple(cell) for cell in seeds.cells.tolist()], seeds
 
 
-def test_published_levels():
-    assert [PUBLISHED.threshold(level) for level in range(3)] == pytest.approx([2e-4, 4e-4, 8e-4])
-    assert [PUBLISHED.cell(level) for level in range(3)] == [16, 4, 1]
-    assert GrowthOptions().threshold(0) == pytest.approx(2e-4 / 3)
-
-
 def test_sampling_probability_of_each_level():
     count = 40_000
     cells = [[64 * i, 0, 0] for i in range(count)]  # far apart: every anchor may seed its own cell at every level

@@ -7,7 +7,7 @@ import torch
 from support.tiny_scene import tiny_scene
 
 from padgs.geometry.camera import Pinhole
-from padgs.methods.egonerf.grids import interval_lengths, inverse_cdf, jittered, refined, visible_shares
+from padgs.methods.egonerf.grids import inverse_cdf, refined, visible_shares
 from padgs.methods.egonerf.model import RayPixels
 from padgs.scene import View
 
@@ -103,13 +103,6 @@ def test_refined_samples_follow_the_weights():
     weights[0, 4] = 1.0  # at distance 5
     found = refined(distances, weights, torch.linspace(0.01, 0.99, 50)[None])
     assert ((found >= 4.5) & (found <= 5.5)).all()
-
-
-def test_jitter_stays_within_the_interval(generator):
-    distances = torch.tensor([1.0, 2.0, 4.0, 8.0]).expand(100, 4)
-    moved = jittered(distances, torch.rand(100, 4, generator=generator))
-    assert ((moved >= distances) & (moved <= distances + interval_lengths(distances))).all()
-    assert (moved.diff(dim=-1) > 0).all()
 
 
 DENSITY = 0.7

@@ -276,7 +276,8 @@ def test_unsupported_gpus_are_named(monkeypatch: pytest.MonkeyPatch):
     ):
         cuda.check_device.__wrapped__(0)
     monkeypatch.setattr(cuda, "check_device", cuda.check_device.__wrapped__)
-    assert not cuda.works_on(torch.device("cuda", 0)), "or there is no way out by backend=torch"
+    with pytest.raises(RuntimeError, match="Tesla T4"):  # or there is no way out by backend=torch
+        cuda.require(torch.device("cuda", 0))
 
 
 @pytest.fixture
@@ -337,6 +338,6 @@ def test_missing_library_warns_and_uses_torch(tmp_path, monkeypatch: pytest.Monk
     assert "slower than cuda: libpadgs_cuda.so not found in" in str(caught[0].message) and "nvcc" in str(
         caught[0].message
     )
-    monkeypatch.setattr(cuda, "works_on", lambda device: True)
+    monkeypatch.setattr(cuda, "require", lambda device: None)
     assert package.resolve_backend("auto", means) == "cuda"
     assert package.resolve_backend("auto", SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64)) == "torch"
