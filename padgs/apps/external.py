@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from padgs.apps.export.explicit import transform_splats
-from padgs.apps.export.splat_file import CONVERTED, read_splats
+from padgs.apps.export.splat_file import READ, read_splats
 from padgs.apps.frame_check import FrameCheck, as_numbers, check_frame, read_transform
 from padgs.checks import unknown
 from padgs.data.capture import FARTHEST, DataError, listed
@@ -44,7 +44,6 @@ from padgs.runs.store import Labels, RunStore
 from padgs.scene import Scene, View
 
 METHOD = "external"  # name in results
-SPLATS = (".ply", *(suffix for suffix in CONVERTED if suffix != ".html"))
 RAYS = {
     "exact": replace(PlusMethod.RENDER, steepness=0.0),  # as padgs_plus, but Gaussians
     # as ordinary viewers: affine footprints, widened by 0.3 square pixels of the panorama, on the faces of a cube
@@ -82,7 +81,7 @@ class ExternalMethod(SplatMethod):
 
 def is_splat_file(path: str) -> bool:
     """Return whether a path is a file of Gaussians, not the folder of a run."""
-    return path.lower().endswith(SPLATS) and not Path(path).is_dir()
+    return path.lower().endswith(READ) and not Path(path).is_dir()
 
 
 def config_of(data: str, render: RenderConfig | None = None, device: str = "auto", **settings: Any) -> RunConfig:
@@ -121,7 +120,7 @@ class ExternalRun(LoadedRun):
 
     @classmethod
     def open(cls, file: Path, config: RunConfig | None, rays: str, transform: str, device: str) -> ExternalRun:
-        """Open a file of Gaussians with a suffix of `SPLATS`, rendered by a name of `RAYS`; device: auto, cpu or cuda.
+        """Open a file of Gaussians with a suffix of `READ`, rendered by a name of `RAYS`; device: auto, cpu or cuda.
 
         `config` is from `config_of`; None: no data set, so the scene is made of the Gaussians, without photographs.
         `transform` is data_from_file for `read_transform`; empty: the identity. Where the data set has map coordinates,
@@ -202,7 +201,7 @@ def open_model(
         if transform or rays != "exact":
             raise ValueError(f"{path} is a run, whose renderer and world are known; leave out --rays and --transform")
         if Path(path).is_file():
-            kinds = f"{', '.join(SPLATS)}, and no folder of a run"
+            kinds = f"{', '.join(READ)}, and no folder of a run"
             raise ValueError(f"{path} is no {kinds}; give one of these; splat-transform makes .ply of many formats")
         return replace(load_run(path, data_path=data, device=device), opened_with=opened_with)
     config = None if data is None else config_of(data, device=device)

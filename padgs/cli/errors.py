@@ -17,7 +17,7 @@ from padgs.checks import printable
 from padgs.runs.interrupt import ending_by_signals
 
 Run = Annotated[str, typer.Argument(help="folder of a run, as padgs-run names it at its end")]
-Model = Annotated[str, typer.Argument(help="folder of a run, or a .ply, .compressed.ply, .spz or .sog of Gaussians")]
+Model = Annotated[str, typer.Argument(help="folder of a run, or a .ply, .spz, .sog, .splat or .ksplat of Gaussians")]
 Rays = Annotated[str, typer.Option(help="how to draw a file of Gaussians: exact, or ewa as ordinary viewers do")]
 Transform = Annotated[str, typer.Option(help="scene from file: 4x4 matrix, 12 numbers, a file, or identity")]
 DataPath = Annotated[str | None, typer.Option("--data", help="data set, if it has moved; of Gaussians also a run")]

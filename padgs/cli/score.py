@@ -10,7 +10,9 @@ from padgs.cli.errors import Cameras, Depth, Format, Images, Mask, Points, Rays,
 
 
 def score(
-    model: Annotated[str, typer.Argument(help="a .ply, .spz or .sog, or a folder with NAME.png for each test view")],
+    model: Annotated[
+        str, typer.Argument(help="a .ply, .spz, .sog, .splat or .ksplat, or a folder of NAME.png for each test view")
+    ],
     data: Annotated[str, typer.Option(help="folder of the data set, or of a run on it")],
     label: Annotated[str, typer.Option(help="name in tables; default: the program that the file names")] = "",
     rays: Rays = "exact",
@@ -37,6 +39,7 @@ def score(
 
     from rich.console import Console
 
+    from padgs.apps.export.splat_file import READ
     from padgs.apps.external import ExternalOptions, ExternalRun, Renders, config_of, is_splat_file, score_external
     from padgs.runs.config import choose_device
     from padgs.runs.console import show_result
@@ -47,7 +50,7 @@ def score(
     if not path.exists():
         raise FileNotFoundError(f"there is no {model}; give a file of Gaussians, or a folder of renders")
     if not path.is_dir() and not is_splat_file(model):
-        raise ValueError(f"{model} is no .ply, .compressed.ply, .spz or .sog, and no folder of renders")
+        raise ValueError(f"{model} is no {', '.join(READ)}, and no folder of renders")
     settings = {"format": format, "width": width, "mask": mask, "images": images, "points": points}
     settings |= {"depth": depth, "cameras": cameras, "split": split}
     with console.status("opening the data set") as status:

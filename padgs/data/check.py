@@ -98,7 +98,7 @@ def check(
     if hidden := [f"{view.name} ({share:.1%})" for view in views if (share := _hidden(view)) > MAX_HIDDEN]:
         text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "
         text += "255 means use, 0 means ignore: repair them, or set data.mask to none, inverted or a folder"
-        (report.problems if options.mask == "auto" else report.notes).append(text)
+        (report.problems if options.mask == capture.mask == "auto" else report.notes).append(text)
     _check_leaks(scene, digests, report)
     if len(views) > 1 and replace(scene, train=views).has_single_center:
         report.problems.append("all cameras have the same centre; depth cannot be learned")

@@ -365,7 +365,10 @@ def test_wrong_input_is_refused(run, splats, tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\n")
     for arguments, message in (
         (("score", tmp_path / "no.ply", "--data", run), "there is no"),
-        (("score", tmp_path / "a.obj", "--data", run), "is no .ply, .compressed.ply, .spz or .sog"),
+        (
+            ("score", tmp_path / "a.obj", "--data", run),
+            "is no .ply, .compressed.ply, .sog, .spz, .splat, .ksplat, and no folder",
+        ),
         (("score", tmp_path / "a.ply", "--data", run), "a.ply"),
         (("score", splats, "--data", run, "--rays", "x"), "unknown --rays 'x'; known: exact, ewa"),
         (("score", splats, "--data", run, "--width", "64"), "leave out --width"),

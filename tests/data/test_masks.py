@@ -12,6 +12,7 @@ from PIL import Image
 from support.fixtures import World, write_colmap_text, write_transforms
 
 from padgs.data import DataError, load
+from padgs.data.check import check
 from padgs.data.masks import row_weights, write_masks
 
 
@@ -109,6 +110,9 @@ def test_inverted_masks_are_asked_about_and_inverted(folder: Path) -> None:
     assert len({plain, *(load(folder, mask=spec).fingerprint for spec in ("masks", "inverted"))}) == 3
     with pytest.raises(DataError, match="data.mask=inverted:none: there are no mask files to invert"):
         load(folder, mask="inverted:none")
+    (folder / "prepare.json").write_text("{}")  # of `padgs prepare`, which writes masks of narrow crops
+    assert load(folder).train[0].mask().mean() == 6 / 32
+    assert not [problem for problem in check(folder).problems if "masks" in problem]
 
 
 @pytest.mark.parametrize("file", ["masks/pano_00.png", "images/dynamic_mask_pano_00.png"])

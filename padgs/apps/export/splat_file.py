@@ -21,11 +21,15 @@ from torch import Tensor
 from padgs.data.capture import DataError
 from padgs.data.cloud import read_vertices
 from padgs.files import atomic_path, check_place, draft_of
+from padgs.geometry import harmonics
 from padgs.methods.splats.smoothing_filter import widened
 from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
+BYTES = ".splat"  # a row of 32 bytes for each Gaussian, without harmonics (antimatter15)
+READ = (".ply", ".compressed.ply", ".sog", ".spz", BYTES, ".ksplat")
+_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 RUINED = 0.05  # share of Gaussians that a format may move by more than their size
 MAX_LOGIT = 30.0  # formats of 8 bits hold opacities of exactly 0 and 1, whose logits are infinite
 _POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -99,13 +103,19 @@ def _convert(source: Path, target: Path, *more: str) -> None:
         raise ValueError(f"{CONVERTER} failed: {reason[:300]}")
 
 
-def check_suffix(path: Path, doing: str = "writing") -> None:
+def check_suffix(path: Path) -> None:
     """Raise a ValueError early for an unknown suffix, or if the converter that it needs is not installed."""
     if not path.name.lower().endswith((".ply", *CONVERTED)):
         raise ValueError(f"{path} has an unknown format; known: .ply, {', '.join(CONVERTED)}")
     if path.name.lower() in (".ply", *CONVERTED):
         raise ValueError(f"{path} has no name before its suffix; name the file, such as {path.with_name('room.ply')}")
-    if path.name.lower().endswith(CONVERTED) and shutil.which(CONVERTER) is None:
+    if path.name.lower().endswith(CONVERTED):
+        refuse_missing_converter(path, "writing")
+
+
+def refuse_missing_converter(path: Path, doing: str) -> None:
+    """Raise a ValueError if the converter is not installed; `doing` is what needs it."""
+    if shutil.which(CONVERTER) is None:
         raise ValueError(
             f"{doing} {path.name} needs {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
             "or take a .ply, which most programs read and write"
@@ -121,8 +131,10 @@ def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -
     """
     if not path.exists():
         raise DataError(f"{path} does not exist; give a file of Gaussians, or the folder of a run")
-    if path.name.lower().endswith(CONVERTED):
-        check_suffix(path, "reading")
+    if path.name.lower().endswith(BYTES):
+        return _read_bytes(path, unit)
+    if not path.name.lower().endswith(".ply") or path.name.lower().endswith(CONVERTED):
+        refuse_missing_converter(path, "reading")
         with tempfile.TemporaryDirectory(dir=scratch) as folder:
             plain = Path(folder) / "splats.ply"
             if path.name.lower().endswith(".ply"):
@@ -161,6 +173,34 @@ def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -
     splats.load(rows | {"opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT)})
     splats.active_degree = degree
     return widened(splats, columns("filter_3D")[:, 0].square()) if "filter_3D" in names else splats
+
+
+def _read_bytes(path: Path, unit: float) -> Splats:
+    content = path.read_bytes()
+    if not content or len(content) % _ROW.itemsize:
+        raise DataError(
+            f"{path} has {len(content)} bytes, not {_ROW.itemsize} for each Gaussian; copy or export it again"
+        )
+    rows = np.frombuffer(content, _ROW)
+    means, scales = (torch.from_numpy(rows[name].copy()) for name in ("mean", "scale"))
+    colors, opacities, quats = (
+        torch.from_numpy(rows[name].astype(np.float32)) for name in ("color", "opacity", "quat")
+    )
+    empty = torch.zeros(0, 3)
+    splats = Splats(empty, empty, empty, degree=0, scene_scale=unit)
+    quats = quats - 128
+    quats[~quats.any(1), 0] = 1  # no rotation
+    splats.load(
+        {
+            "means": means,
+            "log_scales": scales.clamp(min=torch.finfo(torch.float32).tiny).log(),
+            "quats": quats,
+            "opacity_logits": torch.logit(opacities / 255).clamp(-MAX_LOGIT, MAX_LOGIT),
+            "sh_dc": harmonics.dc_from_colors(colors / 255),
+            "sh_rest": torch.zeros(len(rows), 0, 3),
+        }
+    )
+    return splats
 
 
 def _write_ply(path: Path, splats: Splats, comments: Sequence[str], degree_3: bool = False) -> None:

@@ -1,6 +1,7 @@
 import json
 import math
 import shutil
+import struct
 
 import numpy as np
 import pytest
@@ -37,6 +38,26 @@ def test_columns_of_3dgs(tmp_path, generator):
     splats.active_degree = 1
     write_splats(tmp_path / "a.ply", splats)
     assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
+
+
+def test_rows_of_bytes_are_read(tmp_path):
+    """32 bytes: position and scale as float32, red, green, blue and opacity, and w x y z as 128 (q + 1)."""
+    rows = [(1, 2, 3, 0.5, 0.25, 0, 255, 0, 51, 204, 128 + 64, 128, 0, 128), (*[0] * 3, *[1] * 3, *[0] * 4, *[128] * 4)]
+    (tmp_path / "a.splat").write_bytes(b"".join(struct.pack("<6f8B", *row) for row in rows))
+    found = read_splats(tmp_path / "a.splat", unit=2.0)
+    assert (len(found), found.degree, found.scene_scale) == (2, 0, 2.0)
+    assert found.means[0].tolist() == [1, 2, 3]
+    assert found.log_scales[0, :2].exp().tolist() == [0.5, 0.25] and torch.isfinite(found.log_scales).all()
+    drawn = found.gaussians(tiny_scene().train[0])
+    torch.testing.assert_close(drawn.colors[0], torch.tensor([1.0, 0.0, 0.2]))
+    assert drawn.opacities.tolist() == pytest.approx([0.8, 0.0], abs=1e-6)
+    torch.testing.assert_close(
+        torch.nn.functional.normalize(found.quats[0], dim=0), torch.tensor([1, 0, -2, 0]) / 5**0.5
+    )
+    assert found.quats[1].tolist() == [1, 0, 0, 0], "no rotation"
+    (tmp_path / "a.splat").write_bytes(bytes(33))
+    with pytest.raises(DataError, match=r"a.splat has 33 bytes, not 32 for each Gaussian; copy or export it again"):
+        read_splats(tmp_path / "a.splat")
 
 
 @pytest.mark.parametrize(("degree", "active"), [(0, 0), (2, 1), (3, 2), (3, 3)])
@@ -132,7 +153,7 @@ def test_harmonics_are_numbered_from_0(tmp_path, generator):
 
 
 def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path, generator, monkeypatch):
-    monkeypatch.setattr(splat_file, "check_suffix", lambda *_: None)  # where the converter is missing
+    monkeypatch.setattr(splat_file, "refuse_missing_converter", lambda *_: None)  # where the converter is missing
     write_splats(tmp_path / "a.ply", random_splats(1, generator))
     (tmp_path / "a.compressed.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-9])
     with pytest.raises(DataError, match="a.compressed.ply is not a readable PLY file .*end-of-file"):
@@ -188,7 +209,7 @@ def test_gaussians_that_a_format_cannot_hold_are_counted_or_refused(
             vertex["x"][:moved] += np.float32(0.5 * world)
         PlyData([PlyElement.describe(vertex, "vertex")]).write(str(target))
 
-    monkeypatch.setattr(splat_file, "check_suffix", lambda *_: None)  # where the converter is missing
+    monkeypatch.setattr(splat_file, "refuse_missing_converter", lambda *_: None)  # where the converter is missing
     monkeypatch.setattr(splat_file, "_convert", convert)
     path = tmp_path / "a.spz"
     if "would" in said:
