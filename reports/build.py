@@ -101,8 +101,10 @@ class _Builder:
         runs = run_set.chosen(self.name) if spec.fallback else run_set.of_experiments(*REPORTS[self.name].experiments)
         if spec.rows == "variant":
             runs = runs.loc[runs["variant"].isin([name for titles in TITLES[spec.titles].values() for name in titles])]
-        elif spec.rows != "setting":  # rows of an ablation and runs that were stopped by hand are not methods
+        elif spec.rows != "setting":  # rows of an ablation are not methods
             runs = runs.loc[runs["variant"] == ""]
+        if spec.rows != "run":
+            runs = runs.loc[~runs["stopped"].astype(bool)]
         if spec.outdoor is not None:
             runs = runs.loc[[place.outdoor is spec.outdoor for place in runs["place"]]]
         return PREPARE[spec.prepare](runs)

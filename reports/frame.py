@@ -20,7 +20,17 @@ from padgs.checks import printable
 from padgs.reports.methods import EXTERNAL, METHODS, outside
 from padgs.reports.published import SAME_DATA, Place
 from padgs.reports.store import Run
-from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_LOSSES, SMALLEST_STATED, Result, Scores, flat, picture_name
+from padgs.results import (
+    AD_HOC,
+    DECIDE_NOTHING,
+    SMALLEST_LOSSES,
+    SMALLEST_STATED,
+    STOP_REQUESTED,
+    Result,
+    Scores,
+    flat,
+    picture_name,
+)
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
@@ -279,6 +289,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "machine": _machine,
     "setting": lambda result: setting(values_of(result)),
     "smallest": lambda result: _searched(result.smallest),
+    "stopped": lambda result: result.ended == STOP_REQUESTED,  # by hand
     "view_psnr": lambda result: _view_psnr(result.scores),
 }
 NUMBERS: Mapping[str, Callable[[Result], float | None]] = {

@@ -96,15 +96,17 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
 
 def table(run_set: RunSet) -> Table:
     """Return a block for each scene, resolution and length, and a row for each method whose runs were searched."""
-    blocks, shown = [], {}
+    blocks, shown, unmeasured = [], {}, []
     for _, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
         rows = []
         for method, seeds in by_method(curves(own)).items():
             known = ([n for n in map(number, seeds) if n is not None] for number in COLUMNS.values())
             rows.append(Row(method, tuple(map(mean_cell, known))))
+            if any(step["lpips"] is None for seed in seeds for step in seed.steps):
+                unmeasured.append(f"{title}, {method}: LPIPS was not measured, and did not decide.")
         blocks.append(Block(title, tuple(rows)))
         shown[title] = own
-    notes = (*footnotes(shown, run_set.request.protocol), *NOTES, *SPECS["table3"].notes) if blocks else ()
+    notes = (*footnotes(shown, run_set.request.protocol), *unmeasured, *NOTES, *SPECS["table3"].notes) if blocks else ()
     return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
 
 

@@ -25,7 +25,6 @@ LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}
 MARKDOWN_MARKS = {None: "{}", BEST: "**{}**"}
 MARKDOWN_SPECIAL = re.compile(r"[\\`*_\[\]|~$#<]|&(?=[#\w])|:(?=//)|(?<=www)\.")
 ENTITIES = {"<": "&lt;", "&": "&amp;"}
-LONGEST = 200  # bytes of the name of a chart
 COLUMNS_OF_A_PAGE = 12  # upright
 
 
@@ -48,8 +47,6 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
             yield f"{made.name}.{extension}", write(made).encode()
     elif isinstance(made, Chart):
         name = file_name(made.name)
-        if len(long := name.encode()) > LONGEST:  # which file systems do not accept with an ending
-            name = f"{long[: LONGEST - 10].decode(errors='ignore')}-{hashlib.sha256(long).hexdigest()[:9]}"
         yield f"{name}.png", made.png
         if svg and not isinstance(made.figure, Image.Image):
             yield f"{name}.svg", made.svg.encode()

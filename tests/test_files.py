@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from padgs import results
-from padgs.files import DRAFT, atomic_path, draft_of, read_regular, write_atomically
+from padgs.files import DRAFT, LONGEST, atomic_path, draft_of, file_name, read_regular, write_atomically
 from padgs.runs import checkpoint
 
 KILLED = """
@@ -85,3 +85,11 @@ def test_a_file_is_written_where_folders_cannot_be_forced_to_the_disk(tmp_path, 
     monkeypatch.setattr(os, "fsync", only_files)
     write_atomically(tmp_path / "a", b"all")
     assert (tmp_path / "a").read_bytes() == b"all"
+
+
+@pytest.mark.parametrize("letter", ["a", "室"])
+def test_long_names_are_cut_and_stay_apart(letter):
+    """File systems take 255 bytes with an ending."""
+    names = [file_name(f"{letter * 300}/{last}") for last in "xy"]
+    assert names[0] != names[1] and all(len(name.encode()) <= LONGEST for name in names)
+    assert file_name(letter * 60) == letter * 60

@@ -181,9 +181,17 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
         times = {name: math.fsum(end.timing[name] for end in ends) for name in ("train_seconds", "cpu_seconds")}
         iterations = sum(end.iterations_done for end in ends)
         store.save(method, Progress(iterations, times["train_seconds"], times["cpu_seconds"], 1.0))
-        size = method.size()
+        size, result = method.size(), initial_result(config, scene, store.path.name)
+        chip = "gpu" if result.machine["gpu"] else "cpu"  # reports mix the result with none of one machine and version
+        each = [(end.code_version, end.machine["gpu"] or end.machine["cpu"]) for end in ends]
+        each.append((result.code_version, result.machine[chip]))
+        code, place = (" then ".join(dict.fromkeys(of)) for of in zip(*each, strict=True))
+        if any(end.machine["gpu"] for end in ends):
+            del times["cpu_seconds"]  # says nothing of a GPU
         result = replace(
-            initial_result(config, scene, store.path.name),
+            result,
+            code_version=code[-200:],
+            machine={**result.machine, chip: place[-200:]},
             iterations=iterations,
             iterations_done=iterations,
             counts={**size.counts, "parameters": size.parameters},

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -145,6 +146,9 @@ class ExternalRun(LoadedRun):
             splats.load({name: values[kept] for name, values in rows.items()})
         if not len(splats):
             raise DataError(f"{file} has no Gaussians with finite values; export it again")
+        if re.search(rb"(?im)^comment\s+(splatrendermode:\s*mip|antialiased\s+1)\s*$", _header(file)):
+            how = "for a fair score render the test views in its program, and score the folder of renders"
+            notes.append(f"the file was trained antialiased, which --rays {rays} draws otherwise; {how}")
         program = program_of(file)
         scene = None if config is None else load_scene(config, choose_device(device, render))
         if scene is not None:
@@ -226,10 +230,22 @@ def scene_without_photographs(splats: Splats, file: Path, rotation: Tensor) -> S
     middle = points.double().median(0).values
     if (points - middle).norm(dim=1).median() == 0:
         middle[2] -= 10 * splats.log_scales[opaque].exp().max()
-    if re.search(rb"(?i)comment vertical axis: z\b", _header(file)):  # of nerfstudio
-        pose[:3, :3] = pose.new_tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ rotation.mT
+    if (up := _up_of(file)) is not None:
+        pose[:3, :3] = Similarity.turning(up, (0.0, -1.0, 0.0)).rotation @ rotation.mT
     pose[:3, 3] = -pose[:3, :3] @ middle
     return Scene("no photographs", (View("middle", pose, 2048, 1024),), (), points, colors, "")
+
+
+def _up_of(file: Path) -> Tensor | None:
+    """Return the up that a PLY file states, [3]: "z" (nerfstudio) or three numbers (Brush); None: -y, as in 3DGS."""
+    found = re.search(rb"(?im)^comment vertical axis:[ \t]*([^\r\n]*)", _header(file))
+    words = re.split(r"[\s,\[\]]+", found[1].decode("ascii", "replace").strip("[] \t").lower()) if found else []
+    if words[:1] == ["z"]:
+        words = ["0", "0", "1"]
+    with suppress(ValueError):
+        up = torch.tensor([float(word) for word in words], dtype=torch.float64)
+        return up if len(up) == 3 and up.any() and up.isfinite().all() else None
+    return None
 
 
 def program_of(file: Path) -> tuple[str, str]:

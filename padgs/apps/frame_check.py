@@ -16,6 +16,7 @@ from torch import Tensor
 
 from padgs.data.capture import DataError
 from padgs.data.formats.path_file import TRANSFORMS, nerfstudio_world
+from padgs.data.splits import read_lines
 from padgs.evaluation.metrics import mean_color, sphere_weight, ws_psnr
 from padgs.evaluation.scoring import ONE_COLOR, Render
 from padgs.geometry.similarity import Similarity
@@ -39,14 +40,14 @@ def read_transform(text: str, transforms_json: Path | None = None) -> Similarity
         return Similarity()
     file, is_file = Path(text), os.path.isfile(text)  # Path.is_file refuses long texts
     try:
-        if is_file and file.suffix == ".npy":
+        if is_file and file.suffix.lower() == ".npy":
             numbers: Any = np.load(file)
-        elif is_file and file.suffix == ".json":
-            numbers = json.loads(file.read_text())
+        elif is_file and file.suffix.lower() == ".json":
+            numbers = json.loads(file.read_bytes())  # in UTF-8 or UTF-16
             if isinstance(numbers, dict):
                 return nerfstudio_world(file, transforms_json)
         else:
-            numbers = (file.read_text() if is_file else text).replace(",", " ").split()
+            numbers = (" ".join(read_lines(file)) if is_file else text).replace(",", " ").split()
         matrix = np.asarray(numbers, np.float64).reshape(-1, 4)
     except DataError as error:  # which would be taken for one of the run's data
         raise ValueError(str(error)) from error

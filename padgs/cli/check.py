@@ -46,12 +46,12 @@ def check(
     end_with(report, OF_DATA)
 
 
-def overlay_path(data: Path) -> Path:
-    """Return the default file of the overlay: beside the data, or in the working folder if that is read-only."""
+def overlay_path(data: Path) -> Path | None:
+    """Return the default file of the overlay: beside the data, or in the working folder; None if both are read-only."""
     from padgs.data.check import OVERLAY
 
     folder = data if data.is_dir() else data.parent
-    return (folder if os.access(folder, os.W_OK) else Path()) / OVERLAY
+    return next((place / OVERLAY for place in (folder, Path()) if os.access(place, os.W_OK)), None)
 
 
 def end_with(report: Report, names: Iterable[str]) -> NoReturn:

@@ -90,7 +90,7 @@ def read_las(path: Path) -> tuple[Cloud, tuple[str, ...]]:
 def read_e57_points(path: Path) -> tuple[Cloud, tuple[str, ...]]:
     """Read the points of all scans of an E57 file in the file's common frame, and notes."""
     with open_e57(path) as file:
-        headers = [file.get_header(index) for index in range(file.scan_count)]
+        headers = [file.get_header(index) for index in range(file.scan_count if file.root.isDefined("data3D") else 0)]
         step = -(-sum(header.point_count for header in headers) // MOST_POINTS) or 1
         cloud, notes = joined([_scan(file, header, step) for header in headers])
     cloud, thinned = _thinned(path, cloud, step)

@@ -92,7 +92,7 @@ class Board:
     def output(self, job: int) -> TextIO:
         """Open the file for the screen output of a job in a process of its own; the caller closes it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        return (self.folder / f"{job:05d}.log").open("a", buffering=1)
+        return (self.folder / f"{job:05d}.log").open("a", buffering=1, encoding="utf-8")
 
     def request_stop(self) -> None:
         """Ask running jobs to write their checkpoints and stop, and waiting jobs not to start."""

@@ -48,7 +48,7 @@ class DataConfig(DataSettings):
     @property
     def synthetic(self) -> SyntheticOptions:
         """Options of a generated scene; a ConfigError names an unknown key or a value of the wrong type."""
-        width = {} if self.width is None else {"width": self.width}
+        width = {"width": self.width} if self.width is not None and self.path is None else {}
         return typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
 
     def options(self, device: str) -> DataOptions:

@@ -53,6 +53,8 @@ def _stop(number: int, frame: FrameType | None) -> None:
 def ending_by_signals(advice: str = "") -> Iterator[None]:
     """Answer signals: print the advice and exit with 128 + number, silently if the reader of the output has ended."""
     answer_signals()
+    if hasattr(sys.stdout, "reconfigure"):  # of a terminal that is not in Unicode
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             yield

@@ -145,7 +145,7 @@ class _Outcome:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: object) -> bool:
         if isinstance(error, KeyboardInterrupt) and not isinstance(error, Interrupted):
             raise Interrupted("stopped at once, the last checkpoint stands") from error
-        if isinstance(error, DataError) or not isinstance(error, Exception):
+        if isinstance(error, DataError | UnicodeError) or not isinstance(error, Exception):
             return False
         if isinstance(error, Failure):
             status, reason = error.status, str(error)
@@ -256,8 +256,14 @@ def _joined(result: Result, before: Progress) -> tuple[Result, tuple[str, str]]:
     """Return the result with all code and hardware of a resumed run, so that reports mix it with no other; and both."""
     chip = "gpu" if result.machine["gpu"] else "cpu"
     pairs = zip(before.made_by, (result.code_version, result.machine[chip]), strict=True)
-    code, place = (now if old in ("", now) else f"{old.removesuffix(f' then {now}')} then {now}" for old, now in pairs)
+    code, place = (_then(old, now) for old, now in pairs)
     return replace(result, code_version=code, machine={**result.machine, chip: place}), (code, place)
+
+
+def _then(old: str, now: str) -> str:
+    """Return both in order, or of a long list the first and the last; results hold names of up to 255 letters."""
+    words = now if old in ("", now) else f"{old.removesuffix(f' then {now}')} then {now}"
+    return words if len(words) <= 200 else f"{words.partition(' then ')[0]} then others then {now}"
 
 
 def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, method: Method) -> float | None:

@@ -78,8 +78,8 @@ def html(run_set: RunSet) -> str:
         sweeps=_charts(made["sweep"]),
         views=views,
         data=json.dumps(scenes).replace("<", "\\u003c"),  # no end of script
-        styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text()]),
-        scripts=[*(_vendored(name) for name in SCRIPTS), (HERE / "page.js").read_text()],
+        styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text("utf-8")]),
+        scripts=[*(_vendored(name) for name in SCRIPTS), (HERE / "page.js").read_text("utf-8")],
         notice=_vendored("NOTICE.md"),
     )
 
@@ -88,7 +88,7 @@ def album(run_set: RunSet) -> Album:
     """Return a few views of each scene, of all settings of methods and rows of ablations; one seed is enough."""
     runs, parts = run_set.chosen("table1"), run_set.chosen("table3")
     own = pd.concat([runs, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
-    own = own.loc[own["ok"] & (own["renders"].map(render_names).map(len) > 0)]
+    own = own.loc[own["ok"] & ~own["stopped"].astype(bool) & (own["renders"].map(render_names).map(len) > 0)]
     groups = {place: sorted(settings(runs), key=_mean_psnr, reverse=True) for place, runs in by_place(own).items()}
     groups = dict(sorted(groups.items(), key=lambda group: bool(group[0].dataset)))  # the user's captures first
     count = min(MAX_VIEWS, max(1, MAX_FILES // max(1, sum(map(len, groups.values())))))
@@ -176,4 +176,4 @@ def _charts(parts: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def _vendored(name: str) -> str:
-    return (HERE / "vendor" / name).read_text()
+    return (HERE / "vendor" / name).read_text("utf-8")

@@ -200,10 +200,13 @@ def test_blocks_that_were_trained_differently_are_joined_with_a_note(parts, runs
 def test_a_merged_run_has_the_preset_of_its_blocks_and_stands_beside_them(runs, tmp_path, monkeypatch):
     copies = [Path(shutil.copytree(run, tmp_path / "moved" / Path(run).name)) for run in runs]
     for copy in copies:
-        results.write(replace(results.read(copy / "result.json"), preset="omnigs_release"), copy)
+        found = results.read(copy / "result.json")
+        results.write(replace(found, preset="omnigs_release", machine={**found.machine, "gpu": "A100"}), copy)
     monkeypatch.chdir(tmp_path)
     path = merge([str(copy.relative_to(tmp_path)) for copy in copies], Console(quiet=True))
-    assert path.parent == tmp_path / "moved" and padgs.load_run(path, device="cpu").result.preset == "omnigs_release"
+    merged = padgs.load_run(path, device="cpu").result
+    assert path.parent == tmp_path / "moved" and merged.preset == "omnigs_release"
+    assert merged.machine["cpu"].startswith("A100 then ") and "cpu_seconds" not in merged.timing
 
 
 def test_the_source_is_found_through_links(source, tmp_path, monkeypatch):

@@ -260,3 +260,10 @@ def _rotate_points(folder: Path) -> None:
         return "\n".join(" ".join([row[0], row[1], row[3], repr(-float(row[2])), *row[4:]]) for row in rows) + "\n"
 
     _edit(folder, "sparse/0/points3D.txt", rotated)
+
+
+def test_without_a_folder_to_write_to_there_is_no_overlay_and_no_problem(world: World, tmp_path: Path, monkeypatch):
+    write_colmap_text(world, tmp_path / "data")
+    monkeypatch.setattr("padgs.cli.check.os.access", lambda *_: False)
+    done = CliRunner().invoke(app, ["check", str(tmp_path / "data")])
+    assert done.exit_code == 0 and "overlay" not in done.output, done.output

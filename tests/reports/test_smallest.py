@@ -60,6 +60,15 @@ def test_a_row_for_each_search_with_its_smallest_models():
     assert table(run_set(runs()[2:])).blocks == () and charts(run_set(runs()[2:])) == []
 
 
+def test_a_search_that_lpips_did_not_decide_says_so():
+    with_lpips = [{**step, "lpips": 0.1} for step in runs()[0].smallest["steps"]]
+    measured = replace(runs()[0], smallest={**runs()[0].smallest, "steps": with_lpips})
+    notes = table(run_set([measured, runs()[1]])).notes
+    assert [note for note in notes if "LPIPS was not measured" in note] == [
+        "synthetic-room, 512x256, 1000 iterations, PaD-GS: LPIPS was not measured, and did not decide."
+    ]
+
+
 def test_the_marks_of_the_best_numbers_are_explained():
     seeds = [replace(one, seed=seed, run=f"{one.run}_{seed}") for one in runs()[:2] for seed in range(3)]
     text = markdown(table(run_set(seeds)))

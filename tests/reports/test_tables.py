@@ -13,7 +13,7 @@ from padgs.reports.significance import BEST, SECOND, emphasis
 from padgs.reports.specs import DEVIATIONS, PARTS, RUNGS, WITHOUT
 from padgs.reports.table import ReportError, Table
 from padgs.reports.writers import markdown
-from padgs.results import Scores
+from padgs.results import STOP_REQUESTED, Scores
 
 table1, table4, methods, equal_time = map(builder, ("table1", "table4", "methods", "equal_time"))
 ladder, deviations, order, length = map(builder, ("ladder", "deviations", "order", "length"))
@@ -43,7 +43,8 @@ def repeated(made):
 
 
 def stopped(run):
-    return replace(run, run="stopped", seed=9, variant="stopped after 9 iterations")
+    ended = {"seed": 9, "variant": "stopped after 9 iterations", "ended": STOP_REQUESTED}
+    return replace(run, run="stopped", **ended)
 
 
 def crossed(seeds=(0.0, 0.1)):
@@ -127,6 +128,7 @@ def test_each_variant_that_can_be_run_has_a_row(root, table, titles):
         (capacity, budgets(BUDGETS)),
         (learning_rates, scaled(lambda n: 2)),
         (equal_time, [timed("padgs", 100, 900, 25), timed("omnigs", 100, 900, 24)]),
+        (order, ordered()),
     ],
 )
 def test_a_stopped_run_is_no_seed(build, made):

@@ -10,7 +10,7 @@ from padgs.baselines import METHODS
 from padgs.checks import ConfigError, lookup
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.multirun.composition import composing
-from padgs.runs.config import Settings, config_from_values
+from padgs.runs.config import DataConfig, Settings, config_from_values
 
 MEANINGLESS = {
     "render.near=inf": "render.near is inf; it must be finite",
@@ -108,3 +108,9 @@ def test_every_number_has_limits(method):
         place[name] = [1e30, 1.0] if key.endswith("]") else 1e30
         with pytest.raises(ConfigError, match=f"{name}.* is 1e.30; it must be from .* to "):
             config_from_values(values)
+
+
+def test_the_width_of_a_capture_is_not_that_of_a_generated_scene():
+    assert DataConfig(path="x", format="auto", width=12288).options("cpu").width == 12288
+    with pytest.raises(ValueError, match="are 2.3 billion pixels"):
+        DataConfig(width=12288)

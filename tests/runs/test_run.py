@@ -26,8 +26,8 @@ from padgs.reports import store
 from padgs.reports.frame import frame
 from padgs.reports.selection import RunSet
 from padgs.runs import run as pipeline
-from padgs.runs.run import Callback, build_method, load_scene
-from padgs.runs.store import Labels, RunBusy, RunFolderError, RunStore, labels
+from padgs.runs.run import Callback, _joined, build_method, load_scene
+from padgs.runs.store import Labels, Progress, RunBusy, RunFolderError, RunStore, labels
 from padgs.training.health import Failure
 from padgs.training.loop import Record
 from padgs.training.options import Budget
@@ -345,3 +345,24 @@ def test_a_full_disk_while_logging_is_a_clear_error(config, monkeypatch):
     stop_at(1, monkeypatch, lambda: (folder_of(config).path / "log.jsonl").symlink_to("/dev/full"))
     with pytest.raises(RunFolderError, match="No space left on device; make room"):
         run(config)
+
+
+def test_versions_of_a_run_that_was_resumed_often_stay_a_name(config):
+    result, before = run(config)[0], Progress(0, 0.0, 0.0, 0.0)
+    for commit in range(40):
+        newest, made_by = _joined(replace(result, code_version=f"{commit:010d}"), before)
+        before = replace(before, made_by=made_by)
+    assert newest.code_version.startswith("0000000000 then others then ") and newest.code_version.endswith("0000000039")
+    assert results.decoded(results.encoded(newest), "") == newest
+
+
+def test_a_terminal_without_unicode_changes_no_result(config):
+    raw = io.BytesIO()
+    console = Console(file=io.TextIOWrapper(raw, "latin-1", errors="backslashreplace"), width=200)
+    assert pipeline.run(config, console).ok and raw.getvalue()
+
+
+def test_a_text_that_cannot_be_shown_is_no_status_of_a_run(config):
+    with pytest.raises(UnicodeError):
+        pipeline.run(config, Console(file=io.TextIOWrapper(io.BytesIO(), "latin-1"), width=200))
+    assert not [*Path(config.run.folder).glob("*/result.json")]

@@ -7,6 +7,7 @@ zeros fill the others up.
 """
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -35,6 +36,8 @@ MAX_LOGIT = 30.0  # formats of 8 bits hold opacities of exactly 0 and 1, whose l
 _POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = [name for name in (*_POSITION, *_COLOR, *_LAST) if name != "scale_2"]
+_PAINT = ("red", "green", "blue")
+_FLAT = math.log(torch.finfo(torch.float32).tiny)  # of a scale of 0, whose logarithm is infinite
 _DISC = -9.0  # logarithm of the thickness of discs of 2DGS, which have no scale_2, relative to their smaller radius
 
 
@@ -148,7 +151,9 @@ def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -
     rest = sum(name.startswith("f_rest_") for name in names)
     if "packed_position" in names:
         raise DataError(f"{path} is a compressed PLY; name it {path.stem}.compressed.ply")
-    if missing := [name for name in (*_NEEDED, *(f"f_rest_{n}" for n in range(rest))) if name not in names]:
+    painted = _COLOR[0] not in names and {*_PAINT} <= {*names}  # by `ns-export --ply-color-mode rgb`
+    needed = [name for name in _NEEDED if not (painted and name in _COLOR)]
+    if missing := [name for name in (*needed, *(f"f_rest_{n}" for n in range(rest))) if name not in names]:
         rule = f"Gaussians of 3DGS have {', '.join(_NEEDED)}; a point cloud belongs in data.points"
         raise DataError(f"{path} has no property {missing[0]}; {rule}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
@@ -165,11 +170,12 @@ def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -
     sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
     quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
     quats[~quats.any(1), 0] = 1  # no rotation
-    scales = columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names))
+    scales = columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names)).clamp(min=_FLAT)
     if "scale_2" not in names:
         scales = torch.cat((scales, scales.amin(1, keepdim=True) + _DISC), dim=1)
     rows = {"means": columns(*_POSITION), "log_scales": scales, "quats": quats}
-    rows |= {"sh_dc": columns(*_COLOR), "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2)}
+    dc = harmonics.dc_from_colors(columns(*_PAINT) / 255) if painted else columns(*_COLOR)
+    rows |= {"sh_dc": dc, "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2)}
     splats.load(rows | {"opacity_logits": columns("opacity")[:, 0].clamp(-MAX_LOGIT, MAX_LOGIT)})
     splats.active_degree = degree
     return widened(splats, columns("filter_3D")[:, 0].square()) if "filter_3D" in names else splats
@@ -193,7 +199,7 @@ def _read_bytes(path: Path, unit: float) -> Splats:
     splats.load(
         {
             "means": means,
-            "log_scales": scales.clamp(min=torch.finfo(torch.float32).tiny).log(),
+            "log_scales": scales.log().clamp(min=_FLAT),
             "quats": quats,
             "opacity_logits": torch.logit(opacities / 255).clamp(-MAX_LOGIT, MAX_LOGIT),
             "sh_dc": harmonics.dc_from_colors(colors / 255),

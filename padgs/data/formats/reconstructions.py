@@ -6,18 +6,22 @@ train.txt and test.txt; image sizes are not stated. OpenSfM: `reconstruction.jso
 translation of cam_from_world in each shot.
 """
 
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
+from padgs.data.camera_paths import centers
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, UnknownLens, by_id
 from padgs.data.cloud import color_bytes, first_ply, forgiving, whole_if_possible
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center, cam_from_world, rotation_from_vector
 from padgs.data.splits import check_name
 
+AT_CAMERA = 1e-4  # of the largest distance of a camera to their mean: rounding of text files
 CEREAL_ID = 2**31 - 1  # bits of a polymorphic_id that number the class; the highest marks its first object
 
 
@@ -59,7 +63,7 @@ def read_openmvg(path: Path, options: DataOptions) -> Capture:
     )
     if colored := first_ply(folder, ("colorized.ply", "scene.ply", "pcd.ply"), options.points):
         note = "points: from the PLY file beside sfm_data.json, which has colours"
-        return Capture("openmvg", folder, images, frames, colored, notes=(note,))
+        return Capture("openmvg", folder, images, frames, _without_cameras(colored, frames), notes=(note,))
     stated = data.get("structure")
     structure = stated.entries() if stated else []
     points = Json([item["value"]["X"].value for item in structure], f"X of the structure of {file}")
@@ -84,7 +88,20 @@ def read_released(path: Path, options: DataOptions) -> Capture:
     poses = _mvg_poses(read_json(file_in(path, "data_extrinsics.json")))
     images = image_folder(path, options.images)
     frames = tuple(Frame(view.name, images / view.name, poses[view.pose]) for view in views if view.pose in poses)
-    return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply"), options.points))
+    cloud = first_ply(path, ("pcd.ply", "colorized.ply"), options.points)
+    return Capture("released", path, images, frames, cloud and _without_cameras(cloud, frames))
+
+
+def _without_cameras(cloud: Cloud, frames: Sequence[Frame]) -> Cloud:
+    """Return a cloud without the green points at the cameras, which OpenMVG adds to colorized.ply."""
+    if cloud.colors is None or not frames:
+        return cloud
+    green = (cloud.colors == torch.tensor([0, 255, 0], dtype=torch.uint8)).all(1).nonzero()[:, 0]
+    places = centers(torch.stack([frame.cam_from_world for frame in frames]))
+    near = torch.cdist(cloud.points[green].double(), places).amin(1)
+    kept = torch.ones(len(cloud.points), dtype=torch.bool)
+    kept[green[near <= AT_CAMERA * (places - places.mean(0)).norm(dim=1).max()]] = False
+    return Cloud(cloud.points[kept], cloud.colors[kept])
 
 
 def _mvg_views(data: Json) -> list[MvgView]:

@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from posixpath import commonpath
 
+import torch
+
 from padgs.data.assemble import IMAGE_FOLDERS, image_folder
-from padgs.data.capture import Capture, DataError, DataOptions, Frame, UnknownLens, first_of, listed
-from padgs.data.cloud import first_ply, read_ply
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, UnknownLens, first_of, listed
+from padgs.data.cloud import read_ply
 from padgs.data.depths import HOW
 from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
@@ -20,7 +22,13 @@ FILE = "transforms.json"
 REDUCED = "reduce_to"  # `Capture.width`, as `padgs split` states it
 SIDES = {"train": ("transforms_train.json",), "test": ("transforms_test.json", "transforms_val.json")}
 MODELS = ("EQUIRECTANGULAR", "SPHERICAL")
-_PLY = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pcd.ply", "scene.ply")
+LICHTFELD = "pointcloud.ply"  # LichtFeld Studio turns the cameras of panoramas, but not the points
+_PLY = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pcd.ply", "scene.ply", LICHTFELD)
+_SAME, _TURNED = (torch.diag(torch.tensor([x, 1, x, 1], dtype=torch.float64)) for x in (1, -1))
+_READINGS = (
+    Reading("the points are in the world of the poses", _SAME, _SAME),
+    Reading("the points are turned by 180 degrees about y, as for LichtFeld Studio", _SAME, _TURNED),
+)
 
 
 def read(path: Path, options: DataOptions) -> Capture:
@@ -63,16 +71,18 @@ def read(path: Path, options: DataOptions) -> Capture:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
     named, mask = first.get("ply_file_path"), first.get("mask")
-    cloud = None
-    if options.points == "auto":  # else a missing or damaged file does not matter
-        cloud = read_ply(named.path_in(folder)) if named else first_ply(folder, _PLY)
+    cloud, readings = None, tuple[Reading, ...]()
+    # With another source of points a missing or damaged file does not matter.
+    if options.points == "auto" and (stored := named.path_in(folder) if named else first_of(folder, _PLY)):
+        cloud, readings = read_ply(stored), _READINGS if stored.name.lower() == LICHTFELD else ()
     meant = mask.text() if mask else "auto"  # as `padgs split` states it
     if len(metas) > 1 and len(unused := [file for name in SIDES["test"] if (file := first_of(folder, (name,)))]) > 1:
         notes = (f"{unused[1].name} is not used: {unused[0].name} has the test views",)
     if any(frame.get("depth_file_path") for meta in metas.values() for frame in meta["frames"].entries()):
         notes += (f"depth: depth_file_path is not read; {HOW}",)
     width = reduced.whole() if (reduced := first.get(REDUCED)) else None
-    return Capture("transforms", folder, root / prefix, tuple(frames), cloud, split or None, meant, width, notes=notes)
+    content = (root / prefix, tuple(frames), cloud, split or None, meant, width)
+    return Capture("transforms", folder, *content, readings=readings, notes=notes)
 
 
 def transforms_file(path: str | None, format: str) -> Path | None:

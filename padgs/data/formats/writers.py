@@ -61,9 +61,16 @@ def write_transforms(content: Content, folder: Path, **more: Any) -> None:
     for frame in content.frames:
         pose = torch.linalg.inv(frame.cam_from_world)
         pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_OPENGL
-        frame_size = {} if frame.width is None else {"w": frame.width, "h": frame.height}
-        frame_size |= {"share": frame.share} if frame.share != 1 else {}
-        frames.append({"file_path": f"images/{frame.name}", **frame_size, "transform_matrix": pose.tolist()})
+        known = {"file_path": f"images/{frame.name}"}
+        if frame.width is not None and frame.height is not None:  # the focal length is as nerfstudio has it
+            focal = {"fl_x": frame.height, "fl_y": frame.height, "cx": frame.width / 2, "cy": frame.height / 2}
+            known |= {"w": frame.width, "h": frame.height, **focal}
+        known |= {"share": frame.share} if frame.share != 1 else {}
+        frames.append(known | {"transform_matrix": pose.tolist()})
+    paths = ["mask.png"] * len(frames), [f"masks/{view_name(frame.name)}.png" for frame in content.frames]
+    masks = next((some for some in paths if all((folder / path).is_file() for path in some)), ())
+    for known, path in zip(frames, masks, strict=False):  # nerfstudio refuses masks of some frames only
+        known["mask_path"] = path
     meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames, **more}
     if content.cloud is not None:
         write_ply(folder / "sparse_pc.ply", content.cloud)
@@ -71,7 +78,7 @@ def write_transforms(content: Content, folder: Path, **more: Any) -> None:
     if content.split:
         for side in ("train", "test"):
             meta[f"{side}_filenames"] = [f"images/{name}" for name in content.split[side]]
-        meta["val_filenames"] = []
+        meta["val_filenames"] = meta["test_filenames"]
     _write_json(folder / "transforms.json", meta)
 
 
@@ -127,7 +134,8 @@ def write_released(content: Content, folder: Path) -> None:
     _write_json(folder / "data_views.json", {"views": views})
     _write_json(folder / "data_extrinsics.json", {"extrinsics": extrinsics})
     if content.cloud is not None:
-        write_ply(folder / "pcd.ply", content.cloud)
+        colors = torch.from_numpy(_colors(content.cloud))  # the released programs need some
+        write_ply(folder / "pcd.ply", Cloud(content.cloud.points, colors))
     _write_lists(content, folder, extensions=False)
 
 

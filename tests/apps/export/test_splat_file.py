@@ -40,6 +40,23 @@ def test_columns_of_3dgs(tmp_path, generator):
     assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
 
 
+def test_colours_in_place_of_harmonics_are_read(tmp_path, generator):
+    """As of `ns-export gaussian-splat --ply-color-mode rgb`."""
+    splats = random_splats(0, generator)
+    write_splats(tmp_path / "a.ply", splats)
+    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    colors = np.arange(3 * len(table), dtype=np.uint8).reshape(-1, 3)
+    table = rfn.drop_fields(table, ["f_dc_0", "f_dc_1", "f_dc_2"])
+    table = rfn.append_fields(table, ["red", "green", "blue"], list(colors.T), usemask=False)
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
+    drawn = read_splats(tmp_path / "b.ply").gaussians(tiny_scene().train[0]).colors
+    torch.testing.assert_close(drawn, torch.from_numpy(colors) / 255)
+    bare = rfn.drop_fields(table, ["opacity"])
+    PlyData([PlyElement.describe(bare, "vertex")]).write(str(tmp_path / "c.ply"))
+    with pytest.raises(DataError, match="has no property opacity"):
+        read_splats(tmp_path / "c.ply")
+
+
 def test_rows_of_bytes_are_read(tmp_path):
     """32 bytes: position and scale as float32, red, green, blue and opacity, and w x y z as 128 (q + 1)."""
     rows = [(1, 2, 3, 0.5, 0.25, 0, 255, 0, 51, 204, 128 + 64, 128, 0, 128), (*[0] * 3, *[1] * 3, *[0] * 4, *[128] * 4)]

@@ -16,6 +16,7 @@ from support.fixtures import WRITERS, World, write_cloud, write_colmap_text
 from padgs.cli.convert import FORMATS
 from padgs.data import DataError, DataOptions, load, read
 from padgs.data.capture import Frame, view_name
+from padgs.data.cloud import read_ply
 from padgs.data.formats import writers
 from padgs.data.formats.convert import convert
 from padgs.scene import Scene
@@ -65,6 +66,36 @@ def test_help_lists_the_formats_and_nerfstudio_is_one(world: World, tmp_path: Pa
     WRITERS["colmap"](world, tmp_path / "in")
     convert(tmp_path / "in", tmp_path / "out", "nerfstudio")
     assert load(tmp_path / "out", "nerfstudio").notes == load(tmp_path / "out", "transforms").notes
+
+
+def test_nerfstudio_finds_what_it_needs(world: World, tmp_path: Path) -> None:
+    """A focal length, which for a panorama is the height, and masks of all frames or none."""
+    WRITERS["transforms"](world, tmp_path / "in")
+    width, height = world.size
+    hidden = np.full((height, width), 255, np.uint8)
+    hidden[-4:] = 0
+    Image.fromarray(hidden).save(tmp_path / "in" / "mask.png")
+    convert(tmp_path / "in", tmp_path / "out", "nerfstudio")
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    for frame in written["frames"]:
+        assert (frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"]) == (height, height, width / 2, height / 2)
+        assert frame["mask_path"] == "mask.png"
+    assert written["val_filenames"] == written["test_filenames"] != []
+    assert load(tmp_path / "out").train[0].mask().mean() == 1 - 4 / height  # type: ignore[union-attr]
+    (tmp_path / "in" / "mask.png").unlink()
+    (tmp_path / "in" / "masks").mkdir()
+    Image.fromarray(hidden).save(tmp_path / "in" / "masks" / f"{world.names[0]}.png")
+    convert(tmp_path / "in", tmp_path / "some", "nerfstudio")
+    assert "mask_path" not in (tmp_path / "some" / "transforms.json").read_text()
+    assert load(tmp_path / "some").fingerprint == load(tmp_path / "in").fingerprint
+
+
+def test_points_without_colours_get_some_for_released_programs(world: World, tmp_path: Path) -> None:
+    WRITERS["openmvg"](world, tmp_path / "in")
+    assert not (tmp_path / "in" / "colorized.ply").exists()
+    convert(tmp_path / "in", tmp_path / "out", "released")
+    cloud = read_ply(tmp_path / "out" / "pcd.ply")
+    assert cloud.colors is not None and len(cloud.colors) == len(world.points)
 
 
 def test_tracks_are_converted(world: World, tmp_path: Path) -> None:

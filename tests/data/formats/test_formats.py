@@ -5,15 +5,18 @@ import os
 import shutil
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from support.fixtures import (
     WRITERS,
     World,
     paint,
+    write_cloud,
     write_colmap_binary,
     write_colmap_text,
     write_openmvg,
@@ -363,3 +366,28 @@ def _written(
     change(meta)
     path.write_text(json.dumps(meta))
     return meta
+
+
+def test_the_cameras_in_a_cloud_of_openmvg_are_left_out(world: World, tmp_path: Path) -> None:
+    """openMVG_main_ComputeSfM_DataColor adds a green point at each camera."""
+    write_openmvg(world, tmp_path)
+    green = np.tile(np.array([0, 255, 0], np.uint8), (len(world.centers) + 1, 1))
+    points = np.concatenate((world.points, world.centers.round(5), [[0.25, 0.5, 0.125]]))
+    write_cloud(replace(world, points=points, colors=np.concatenate((world.colors, green))), tmp_path / "colorized.ply")
+    scene = load(tmp_path)
+    expected = np.concatenate((world.points, [[0.25, 0.5, 0.125]]))  # a green leaf stays
+    torch.testing.assert_close(scene.points, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_points_for_lichtfeld_studio_are_turned_back(turned: bool, world: World, tmp_path: Path) -> None:
+    """It turns the cameras of panoramas by 180 degrees about y, and not the points of pointcloud.ply."""
+    write_transforms(world, tmp_path)
+    cloud = tmp_path / "pointcloud.ply"
+    described = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / described.pop("ply_file_path")).unlink()
+    (tmp_path / "transforms.json").write_text(json.dumps(described))
+    write_cloud(replace(world, points=world.points * ([-1, 1, -1] if turned else [1, 1, 1])), cloud)
+    scene = load(tmp_path)
+    torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float(), atol=1e-5, rtol=0)
+    assert any(("turned by 180 degrees" in note) == turned for note in scene.notes if note.startswith("the points are"))
