@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import TextIOWrapper
 from types import FrameType
 
 from padgs.checks import printable
@@ -53,7 +54,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 def ending_by_signals(advice: str = "") -> Iterator[None]:
     """Answer signals: print the advice and exit with 128 + number, silently if the reader of the output has ended."""
     answer_signals()
-    if hasattr(sys.stdout, "reconfigure"):  # of a terminal that is not in Unicode
+    if isinstance(sys.stdout, TextIOWrapper):  # of a terminal that may not be in Unicode
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:

@@ -65,7 +65,7 @@ def test_a_search_that_lpips_did_not_decide_says_so():
     measured = replace(runs()[0], smallest={**runs()[0].smallest, "steps": with_lpips})
     notes = table(run_set([measured, runs()[1]])).notes
     assert [note for note in notes if "LPIPS was not measured" in note] == [
-        "synthetic-room, 512x256, 1000 iterations, PaD-GS: LPIPS was not measured, and did not decide."
+        "synthetic-room (generated, tuned on), 512x256, 1500 iterations, PaD-GS: LPIPS was not measured, and did not decide."
     ]
 
 
