@@ -191,6 +191,9 @@ def _hardware(result: Result) -> str:
     return f"{where}, torch {known.get('torch')}"
 
 
+SEARCHED_ON = "machine of the search"  # for the smallest model; its times are of that
+
+
 def _machine(result: Result) -> str:
     """Return the hardware with the number of threads, on which times depend."""
     threads = result.machine.get("threads")
@@ -287,6 +290,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "learning_rates": _learning_rates,
     "hardware": _hardware,
     "machine": _machine,
+    SEARCHED_ON: lambda result: _machine(replace(result, machine=result.smallest.get("machine", result.machine))),
     "setting": lambda result: setting(values_of(result)),
     "smallest": lambda result: _searched(result.smallest),
     "stopped": lambda result: result.ended == STOP_REQUESTED,  # by hand

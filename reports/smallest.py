@@ -7,7 +7,8 @@ from typing import Any
 from pandas import DataFrame
 
 from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, set_axis, spans, styled
-from padgs.reports.conditions import OF_TIMES, footnotes, sheets
+from padgs.reports.conditions import CONDITIONS, footnotes, sheets
+from padgs.reports.frame import SEARCHED_ON
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import mean_cell
 from padgs.reports.specs import SPECS
@@ -97,7 +98,7 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
 def table(run_set: RunSet) -> Table:
     """Return a block for each scene, resolution and length, and a row for each method whose runs were searched."""
     blocks, shown, unmeasured = [], {}, []
-    for _, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
+    for _, title, own in sheets(searched(run_set), run_set.request, "smallest", (*CONDITIONS, SEARCHED_ON)):
         rows = []
         for method, seeds in by_method(curves(own)).items():
             known = ([n for n in map(number, seeds) if n is not None] for number in COLUMNS.values())
@@ -113,7 +114,7 @@ def table(run_set: RunSet) -> Table:
 def charts(run_set: RunSet) -> list[Chart]:
     """Return a chart for each scene that was searched."""
     found = []
-    for name, title, own in sheets(searched(run_set), run_set.request, "smallest", OF_TIMES):
+    for name, title, own in sheets(searched(run_set), run_set.request, "smallest", (*CONDITIONS, SEARCHED_ON)):
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
     return found

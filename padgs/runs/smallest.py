@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from padgs import results
-from padgs.clock import Lap, timed
+from padgs.clock import Lap, machine, timed
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.methods.splats.importance import importance_scores
@@ -119,15 +119,17 @@ class Search:
         """Return what the search found, for `Result.smallest`.
 
         Returns:
-            row: gaussians or anchors; rows, ws_psnr: of the searched run; minimal, possible: epsilon -> index of
-            `smallest`, `smallest_possible`; steps: all candidates, the control first, each with
-            its loss against the control and the objections at each epsilon; views: names of those that decide;
+            row: gaussians or anchors; machine: on which times were measured; rows, ws_psnr: of the searched run;
+            minimal, possible: epsilon -> index of `smallest`, `smallest_possible`; steps: all candidates, the control
+            first, each with its loss against the control and the objections at each epsilon; views: names of those
+            that decide;
             seconds, cpu_seconds: of all candidates.
         """
         found = self.candidates
         whole = evaluate(self.run.method.render, self.run.scene.test, replace(RULES, lpips="none"))
         return {
             "row": self.row,
+            "machine": machine(self.run.scene.points.device),
             "rows": self.rows,
             "ws_psnr": whole.metrics[candidates.QUALITY],
             "minimal": {f"{e:g}": found.index(candidates.smallest(found, e, self.shares)) for e in SMALLEST_LOSSES},
