@@ -28,21 +28,23 @@ _OTHER_FORMATS = {b"ftyp": "HEIC, AVIF or video", b"%PDF": "PDF", b"\0\0\0\x0cJX
 DAMAGE = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, ArithmeticError, struct.error)
 MAX_PIXELS = 180_000_000  # a panorama of 18972x9486
 
-LONGEST = 200  # bytes of the name of a file
+LONGEST = 200  # bytes of `file_name`; file systems take 255, with an ending
 DRAFT = ".padgs-draft-"  # begins the names of files and folders that are not complete
 DAY = 86400.0  # seconds
 
 
 def file_name(text: str) -> str:
-    """Return a text as a file name without separators, of at most `LONGEST` bytes and without an ending; letters of all
-    languages stay, since names may differ in them.
+    """Return a text as a file name without separators and of at most `LONGEST` bytes, so that an ending still fits.
+
+    Letters of all languages stay, since names may differ in them; longer names end with a digest.
 
     >>> file_name("left/R001 a"), file_name("chart_../../etc"), file_name("客厅 1")
     ('left-R001-a', 'chart_..-..-etc', '客厅-1')
     """
     name = re.sub(r"[^\w.-]+", "-", text)
     if len(long := name.encode()) > LONGEST:  # which file systems do not accept with an ending
-        name = f"{long[: LONGEST - 10].decode(errors='ignore')}-{hashlib.sha256(text.encode()).hexdigest()[:9]}"
+        digest = hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:9]
+        name = f"{long[: LONGEST - 10].decode(errors='ignore')}-{digest}"
     return name
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from pandas import DataFrame
 
 from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, set_axis, spans, styled
-from padgs.reports.conditions import CONDITIONS, footnotes, sheets
+from padgs.reports.conditions import OF_TIMES, footnotes, sheets
 from padgs.reports.frame import SEARCHED_ON
 from padgs.reports.selection import RunSet, one_setting, settings
 from padgs.reports.significance import mean_cell
@@ -97,24 +97,26 @@ COLUMNS: dict[Column, Callable[[Curve], float | None]] = {
 
 def table(run_set: RunSet) -> Table:
     """Return a block for each scene, resolution and length, and a row for each method whose runs were searched."""
-    blocks, shown, unmeasured = [], {}, []
-    for _, title, own in sheets(searched(run_set), run_set.request, "smallest", (*CONDITIONS, SEARCHED_ON)):
+    blocks, shown, more = [], {}, []
+    for _, title, own in sheets(searched(run_set), run_set.request, "smallest", (*OF_TIMES, SEARCHED_ON)):
         rows = []
         for method, seeds in by_method(curves(own)).items():
             known = ([n for n in map(number, seeds) if n is not None] for number in COLUMNS.values())
             rows.append(Row(method, tuple(map(mean_cell, known))))
             if any(step["lpips"] is None for seed in seeds for step in seed.steps):
-                unmeasured.append(f"{title}, {method}: LPIPS was not measured, and did not decide.")
+                more.append(f"{title}, {method}: LPIPS was not measured, and did not decide.")
+        elsewhere = own.loc[own[SEARCHED_ON] != own["machine"], SEARCHED_ON].unique()
+        more += [f"{title}: searched on {where}." for where in elsewhere]
         blocks.append(Block(title, tuple(rows)))
         shown[title] = own
-    notes = (*footnotes(shown, run_set.request.protocol), *unmeasured, *NOTES, *SPECS["table3"].notes) if blocks else ()
+    notes = (*footnotes(shown, run_set.request.protocol), *more, *NOTES, *SPECS["table3"].notes) if blocks else ()
     return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
 
 
 def charts(run_set: RunSet) -> list[Chart]:
     """Return a chart for each scene that was searched."""
     found = []
-    for name, title, own in sheets(searched(run_set), run_set.request, "smallest", (*CONDITIONS, SEARCHED_ON)):
+    for name, title, own in sheets(searched(run_set), run_set.request, "smallest", (*OF_TIMES, SEARCHED_ON)):
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
     return found

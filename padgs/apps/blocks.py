@@ -12,7 +12,7 @@ import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from padgs.methods.splats.smoothing_filter import cameras_of
 from padgs.results import flat
 from padgs.runs.console import say, show_result
 from padgs.runs.load import KEYWORDS, LoadedRun, load_run
-from padgs.runs.run import build_method, initial_result, load_scene, scored, start
+from padgs.runs.run import build_method, initial_result, load_scene, scored, start, then
 from padgs.runs.store import Labels, Progress, RunStore
 from padgs.runs.warm_start import WarmStart
 from padgs.scene import Scene, View
@@ -185,13 +185,13 @@ def merge(folders: Sequence[str], console: Console, *, data: str = "", device: s
         chip = "gpu" if result.machine["gpu"] else "cpu"  # reports mix the result with none of one machine and version
         each = [(end.code_version, end.machine["gpu"] or end.machine["cpu"]) for end in ends]
         each.append((result.code_version, result.machine[chip]))
-        code, place = (" then ".join(dict.fromkeys(of)) for of in zip(*each, strict=True))
+        code, place = (reduce(then, dict.fromkeys(of)) for of in zip(*each, strict=True))
         if any(end.machine["gpu"] for end in ends):
             del times["cpu_seconds"]  # says nothing of a GPU
         result = replace(
             result,
-            code_version=code[-200:],
-            machine={**result.machine, chip: place[-200:]},
+            code_version=code,
+            machine={**result.machine, chip: place},
             iterations=iterations,
             iterations_done=iterations,
             counts={**size.counts, "parameters": size.parameters},

@@ -148,7 +148,7 @@ class ExternalRun(LoadedRun):
             raise DataError(f"{file} has no Gaussians with finite values; export it again")
         if re.search(rb"(?im)^comment\s+(splatrendermode:\s*mip|antialiased\s+1)\s*$", _header(file)):
             how = "for a fair score render the test views in its program, and score the folder of renders"
-            notes.append(f"the file was trained antialiased, which --rays {rays} draws otherwise; {how}")
+            notes.append(f"the model was trained antialiased, which --rays {rays} does not reproduce; {how}")
         program = program_of(file)
         scene = None if config is None else load_scene(config, choose_device(device, render))
         if scene is not None:

@@ -12,7 +12,7 @@ def export(
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
     smooth: Annotated[bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html does")] = False,
-    degree_3: Annotated[bool, typer.Option("--degree-3", help="fill up with zeros, if programs need it")] = False,
+    degree_3: Annotated[bool, typer.Option("--degree-3", help="harmonics of degree 3, filled up with zeros")] = False,
     distillation_steps: Annotated[int | None, typer.Option(help="iterations of a fit to renders; default 300")] = None,
     crop: Annotated[str, typer.Option(help="box to keep: lowest and highest x y z, as padgs view shows them")] = "",
     data: DataPath = None,

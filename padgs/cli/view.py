@@ -19,7 +19,7 @@ def view(
     run: Model,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
     port: Annotated[int | None, typer.Option(help="first port to try; default 8080")] = None,
-    host: Annotated[str | None, typer.Option(help="0.0.0.0: all who have the address; default: this machine")] = None,
+    host: Annotated[str | None, typer.Option(help="0.0.0.0 serves all with the address; default: this machine")] = None,
     data: DataPath = None,
     rays: Rays = "exact",
     transform: Transform = "",
@@ -34,6 +34,7 @@ def view(
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.external import is_splat_file, open_model
 
+        opened.clear()
         files = [folder for folder in folders if is_splat_file(folder)]
         place = data or next((folder for folder in folders if folder not in files), None)
         for folder in folders:

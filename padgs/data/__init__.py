@@ -10,12 +10,12 @@ from pathlib import Path
 
 from padgs.checks import lookup
 from padgs.data.assemble import PREPARED, assemble, found_images
-from padgs.data.capture import OTHERS, Capture, DataError, DataOptions
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, first_of
 from padgs.data.cloud import NO_FILE, read_cloud
 from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
-from padgs.data.masks import MASK_FOLDERS
+from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS
 from padgs.files import given_path
 from padgs.scene import Scene
 
@@ -92,8 +92,9 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
     if not isinstance(capture, Capture):
         raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
-    if mask == "auto" and (path / PREPARED).is_file() and (path / MASK_FOLDERS[0]).is_dir():
-        mask = MASK_FOLDERS[0]  # ours, and not inverted: most of a narrow crop may be hidden
+    if mask == "auto" and (path / PREPARED).is_file():
+        ours = first_of(path, SCENE_MASKS[:1]) or first_of(path, MASK_FOLDERS[:1], Path.is_dir)
+        mask = ours.name if ours else mask  # not inverted, though it may hide most of the sphere, as of narrow crops
     capture = replace(capture, mask=mask, notes=(*notes, *capture.notes))
     if options.points != "auto" and any(not one.axes.equal(capture.readings[0].axes) for one in capture.readings):
         with suppress(DataError):  # if its own points cannot be read, nothing says how its images are turned

@@ -52,7 +52,10 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def ending_by_signals(advice: str = "") -> Iterator[None]:
-    """Answer signals: print the advice and exit with 128 + number, silently if the reader of the output has ended."""
+    """Answer signals: print the advice and exit with 128 + number, silently if the reader of the output has ended.
+
+    Output that the terminal cannot show is escaped.
+    """
     answer_signals()
     if isinstance(sys.stdout, TextIOWrapper):  # of a terminal that may not be in Unicode
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -134,7 +134,10 @@ def run(
 
 
 class _Outcome:
-    """Context that turns failures of training into the status of `result`, but no interrupt and no unreadable image."""
+    """Context that turns failures of training into the status of `result`.
+
+    Not interrupts, unreadable images, and text that a terminal cannot show.
+    """
 
     def __init__(self, result: Result, scene: Scene, before: Progress) -> None:
         self.result, self._scene, self._before = result, scene, before
@@ -256,11 +259,11 @@ def _joined(result: Result, before: Progress) -> tuple[Result, tuple[str, str]]:
     """Return the result with all code and hardware of a resumed run, so that reports mix it with no other; and both."""
     chip = "gpu" if result.machine["gpu"] else "cpu"
     pairs = zip(before.made_by, (result.code_version, result.machine[chip]), strict=True)
-    code, place = (_then(old, now) for old, now in pairs)
+    code, place = (then(old, now) for old, now in pairs)
     return replace(result, code_version=code, machine={**result.machine, chip: place}), (code, place)
 
 
-def _then(old: str, now: str) -> str:
+def then(old: str, now: str) -> str:
     """Return both in order, or of a long list the first and the last; results hold names of up to 255 letters."""
     words = now if old in ("", now) else f"{old.removesuffix(f' then {now}')} then {now}"
     return words if len(words) <= 200 else f"{words.partition(' then ')[0]} then others then {now}"

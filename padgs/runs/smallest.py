@@ -119,7 +119,7 @@ class Search:
         """Return what the search found, for `Result.smallest`.
 
         Returns:
-            row: gaussians or anchors; machine: on which times were measured; rows, ws_psnr: of the searched run;
+            row: gaussians or anchors; machine: the one that searched; rows, ws_psnr: of the searched run;
             minimal, possible: epsilon -> index of `smallest`, `smallest_possible`; steps: all candidates, the control
             first, each with its loss against the control and the objections at each epsilon; views: names of those
             that decide;

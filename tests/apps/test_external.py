@@ -382,7 +382,7 @@ def test_the_up_of_a_file_is_that_of_its_header(tmp_path, generator):
 def test_models_that_were_trained_antialiased_have_a_note(comment, warns, tmp_path, generator):
     write_splats(tmp_path / "a.ply", random_splats(0, generator), [comment])
     notes = " ".join(open_model(str(tmp_path / "a.ply"), device="cpu").notes)
-    assert ("trained antialiased, which --rays exact draws otherwise" in notes) == warns
+    assert ("trained antialiased, which --rays exact does not reproduce" in notes) == warns
 
 
 def test_flat_gaussians_stay(tmp_path, generator):

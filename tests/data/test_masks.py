@@ -1,6 +1,7 @@
 """Masks: files, rules, weights and errors."""
 
 import json
+import shutil
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -113,6 +114,10 @@ def test_inverted_masks_are_asked_about_and_inverted(folder: Path) -> None:
     (folder / "prepare.json").write_text("{}")  # of `padgs prepare`, which writes masks of narrow crops
     assert load(folder).train[0].mask().mean() == 6 / 32
     assert not [problem for problem in check(folder).problems if "masks" in problem]
+    shutil.rmtree(folder / "masks")
+    _mask(folder / "mask.png", hidden_rows=26)
+    assert load(folder).train[0].mask().mean() == 6 / 32
+    assert not [problem for problem in check(folder).problems if "mask" in problem]
 
 
 @pytest.mark.parametrize("file", ["masks/pano_00.png", "images/dynamic_mask_pano_00.png"])

@@ -1,4 +1,4 @@
-"""Files of explicit Gaussians: the PLY of 3DGS, written and read; other formats through splat-transform.
+"""Files of explicit Gaussians: the PLY of 3DGS, written and read; .splat, read; others through splat-transform.
 
 A PLY holds per Gaussian x y z, nx ny nz (0; required by SIBR, the viewer of 3DGS), f_dc_0..2, f_rest_0.. (all
 coefficients of red, then green, then blue), opacity (logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z), as
@@ -128,7 +128,7 @@ def refuse_missing_converter(path: Path, doing: str) -> None:
 def read_splats(path: Path, *, unit: float = 1.0, scratch: Path | None = None) -> Splats:
     """Read Gaussians from a file; `unit` is the scene scale, which files do not contain.
 
-    Other formats are made a PLY first, in a folder in `scratch`, by default in that of the system.
+    Formats other than .ply and .splat are made a PLY first, in a folder in `scratch`, by default in that of the system.
     Scales include the 3D filter of Mip-Splatting files. A DataError says that a file holds no Gaussians, a ValueError
     that the converter is not installed.
     """

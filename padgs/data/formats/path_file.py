@@ -91,8 +91,9 @@ def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -
 
 
 def nerfstudio_world(normalized: Path, transforms_json: Path | None) -> Similarity:
-    """Return data_from_nerfstudio, where nerfstudio's world is s (T @ x) for x in the data set's; a DataError without
-    them.
+    """Return data_from_nerfstudio; a DataError if the files do not state it.
+
+    nerfstudio's world is s (T @ x) for x in the data set's world, by scale and transform of `normalized`.
     """
     values = read_json(normalized)  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
     applied = Json({}, "") if transforms_json is None else read_json(transforms_json)
@@ -102,7 +103,7 @@ def nerfstudio_world(normalized: Path, transforms_json: Path | None) -> Similari
         transform = transform @ torch.linalg.inv(_homogeneous(before))
     scale = values["scale"].numbers().item() / (factor.numbers().item() if factor else 1.0)
     if not 0 < scale < math.inf:
-        raise DataError(f"{values['scale'].where} makes a scale of {scale:g}; it must be above 0")
+        raise DataError(f"{values['scale'].where} makes a scale of {scale:g}; it must be above 0: copy it from the run")
     return Similarity(scale, transform[:3, :3], scale * transform[:3, 3]).inverse()
 
 

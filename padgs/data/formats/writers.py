@@ -56,7 +56,7 @@ def write_colmap(content: Content, folder: Path) -> None:
 
 
 def write_transforms(content: Content, folder: Path, **more: Any) -> None:
-    """Write `transforms.json`, with `more` keys, and sparse_pc.ply."""
+    """Write `transforms.json`, with `more` keys and the masks that are in the folder, and sparse_pc.ply."""
     frames = []
     for frame in content.frames:
         pose = torch.linalg.inv(frame.cam_from_world)

@@ -20,7 +20,6 @@ def test_rig_views_are_rotations_and_every_direction_belongs_to_one():
     assert (rotations[:, 1, 1] > 0).all()  # no view hangs upside down
     every = rays(256, 128, dtype=torch.float64)
     owners = torch.stack([(every @ rotations[:, 2].mT).argmax(-1) == index for index in range(12)])
-    assert (owners.sum(0) == 1).all()
     x, y, z = (every @ rotations[:, None].mT).unbind(-1)
     seen = (owners & (z > 0) & (x.abs() <= z) & (y.abs() <= z)).any(0)
     latitude = (torch.arange(128) + 0.5) / 128 * 180 - 90

@@ -188,10 +188,12 @@ def test_a_start_of_several_samples_without_them_is_refused():
     build_method(composed("method=padgs_plus", "render.supersampling=1"))  # the share of padgs_plus is its own default
 
 
-def test_padgs_plus_has_several_samples_in_the_last_three_tenths_of_a_run():
+@pytest.mark.parametrize("iterations", [10, 1200])
+def test_padgs_plus_has_several_samples_in_the_last_three_tenths_of_any_run(iterations):
     scene = tiny_scene()
-    model = make_method("padgs_plus", "method.depth_init_per_pixel=0").build_model(scene, 1200)
-    for model._step, expected in {0: 1, 839: 1, 840: 2, 1200: 2}.items():
+    model = make_method("padgs_plus", "method.depth_init_per_pixel=0").build_model(scene, iterations)
+    for share, expected in {0.0: 1, 0.6: 1, 0.7: 2, 1.0: 2}.items():
+        model._step = round(share * iterations)
         assert model.render_options(scene.train[0]).supersampling == expected
 
 
