@@ -30,9 +30,7 @@ def show_version(requested: bool) -> None:
 
 @app.callback()
 def commands(
-    version: Annotated[
-        bool, typer.Option("--version", callback=show_version, is_eager=True, help="show it")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True, help="show it")] = False,
 ) -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 

@@ -67,7 +67,9 @@ def prepare(
             result = find_poses(Path(source), target, options, tell)
             report = check(target, overlay=overlay_path(target))
     except KeyboardInterrupt as interrupt:
-        raise Interrupted("interrupted; the same command continues") from interrupt
+        is_kept = target.exists() or target.with_name(f".{target.name}.prepare").is_dir()
+        way_on = "continues" if is_kept else "starts over: its first step was not complete"
+        raise Interrupted(f"interrupted; the same command {way_on}") from interrupt
     placed = len(result.registered)
     print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)

@@ -216,6 +216,10 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
             errors = [error.median().item() for error in found]
             if min(errors) <= limit:
                 report.suggestion = known[errors.index(min(errors))].words
+    rows: dict[str, Tensor] = {}  # of the points that each view observes
+    if tracks is not None and capture.cloud is not None and len(capture.cloud.points) == len(scene.points):
+        names = [view_name(frame.name) for frame in capture.frames]
+        rows = {name: tracks.point[tracks.frame == number] for number, name in enumerate(names)}
     # A few points, or points of one colour, correlate with anything or nothing.
     compared = report.coloured and report.points >= MIN_POINTS and scene.point_colors.float().std(0).max() >= 1
     if not (compared or report.observations):
@@ -223,15 +227,16 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     if any("random points" in note for note in scene.notes):
         return
     if report.suggestion is None:
-        _check_exposures(scene, report)
+        _check_exposures(scene, rows, report)
     if not compared:
         return
     views = (*scene.train, *scene.test)
     views = views[:: max(1, len(views) // conventions.VIEWS)][: conventions.VIEWS]
     # In the world of the data set.
     poses = move_origin(torch.stack([view.cam_from_world for view in views]), -scene.origin).double()
-    points, images = scene.points.double() + scene.origin, _small(views)
-    fits = [conventions.colour_fit(one.convert(poses), images, points, scene.point_colors) for one in known]
+    images, (chosen, observed) = _small(views), _observed(scene, rows, views)
+    points, colors = scene.points[chosen].double() + scene.origin, scene.point_colors[chosen]
+    fits = [conventions.colour_fit(one.convert(poses), images, points, colors, observed) for one in known]
     stated, best, least = fits[0], max(fits), conventions.MIN_CORRELATION
     report.colour_correlation = stated
     if best > max(least, stated + conventions.MIN_GAIN) and report.suggestion is None:
@@ -248,12 +253,27 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         )
 
 
-def _check_exposures(scene: Scene, report: Report) -> None:
+def _observed(scene: Scene, rows: dict[str, Tensor], views: Sequence[View]) -> tuple[Tensor, Tensor | None]:
+    """Return the points to compare with views, and whether each view observes each, [F, P] bool; None: not known.
+
+    Walls between rooms hide most points, so those that most views observe are chosen, if views observe enough.
+    """
+    observed = torch.zeros(len(views), len(scene.points), dtype=torch.bool)
+    for row, view in zip(observed, views, strict=True):
+        row[rows.get(view.name, [])] = True
+    most = observed.sum(0).argsort(descending=True, stable=True)[: conventions.POINTS]
+    if observed[:, most].sum(1).median() < MIN_POINTS:
+        return torch.arange(len(scene.points)), None
+    return most, observed[:, most]
+
+
+def _check_exposures(scene: Scene, rows: dict[str, Tensor], report: Report) -> None:
     views = scene.train[:: -(-len(scene.train) // EXPOSURE_VIEWS)]
     if len(views) < 2:
         return
     poses = torch.stack([view.cam_from_world for view in views])
-    gains = conventions.exposure_gains(poses, _small(views), scene.points)
+    chosen, observed = _observed(scene, rows, views)
+    gains = conventions.exposure_gains(poses, _small(views), scene.points[chosen], observed)
     report.exposure_spread = gains.std().item()
     if report.exposure_spread >= UNEVEN_EXPOSURE:
         dark, bright = (views[int(index)].name for index in (gains.argmin(), gains.argmax()))

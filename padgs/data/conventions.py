@@ -38,15 +38,16 @@ class Convention(NamedTuple):
     convert: Callable[[Tensor], Tensor]  # stated poses [F, 4, 4] -> cam_from_world [F, 4, 4]
 
 
-def colour_fit(poses: Tensor, images: Tensor, points: Tensor, colors: Tensor) -> float:
+def colour_fit(poses: Tensor, images: Tensor, points: Tensor, colors: Tensor, observed: Tensor | None = None) -> float:
     """Return the correlation of the colours of points [P, 3] and their pixels; 1 = equal, about 0 = unrelated.
 
     `poses` are cam_from_world [F, 4, 4], `images` [F, H, W, 3] and `colors` [P, 3] uint8; few hundred pixels do. Black
-    pixels, of which a part of a panorama consists elsewhere, do not count.
+    pixels, of which a part of a panorama consists elsewhere, do not count, nor points that are not `observed` [F, P].
     """
     found = _pixels(poses, images, points)
     colors = colors[:: max(1, len(points) // POINTS)].float().expand_as(found)
     seen = (found.amax(-1, keepdim=True) > 0).float()
+    seen = seen if observed is None else seen * observed[:, :: max(1, len(points) // POINTS), None]
     count = seen.sum(1, keepdim=True).clamp(min=1)
     a, b = ((values - (values * seen).sum(1, keepdim=True) / count) * seen for values in (found, colors))
     return ((a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1)).clamp(min=1e-6)).mean().item()
@@ -181,7 +182,7 @@ def _with(poses: Tensor, translation: Tensor, rotation: Tensor | None = None) ->
     return out
 
 
-def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
+def exposure_gains(poses: Tensor, images: Tensor, points: Tensor, observed: Tensor | None = None) -> Tensor:
     """Estimate the gain of each view [F], as log2 of pixel values relative to the median view; 0 if unknown.
 
     A doubling is about two stops of light in sRGB. A pixel is modelled as the gain of its view times the brightness of
@@ -191,6 +192,7 @@ def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
     """
     pixels = _pixels(poses, images, points)
     usable = (pixels.mean(-1) >= DARKEST) & (pixels.amax(-1) <= BRIGHTEST)
+    usable = usable if observed is None else usable & observed[:, :: max(1, len(points) // POINTS)]
     brightness = torch.where(usable, pixels.mean(-1).log2(), torch.nan)  # [F, P]
     gains = brightness.new_zeros(len(brightness))
     for _ in range(ROUNDS):

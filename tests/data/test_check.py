@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from io import BytesIO
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.fixtures import WRITERS, World, write_colmap_text, write_transforms
+from support.fixtures import WRITERS, World, write_colmap_binary, write_colmap_text, write_transforms
 from typer.testing import CliRunner
 
 from padgs.cli.commands import app
@@ -267,3 +268,17 @@ def test_without_a_folder_to_write_to_there_is_no_overlay_and_no_problem(world: 
     monkeypatch.setattr("padgs.cli.check.os.access", lambda *_: False)
     done = CliRunner().invoke(app, ["check", str(tmp_path / "data")])
     assert done.exit_code == 0 and "overlay" not in done.output, done.output
+
+
+def test_points_that_walls_hide_are_no_problem(world: World, tmp_path: Path) -> None:
+    write_colmap_binary(world, tmp_path)
+    file, random = tmp_path / "sparse/0/points3D.bin", np.random.default_rng(0)
+    places, colors = random.normal(0, 2, (3600, 3)).tolist(), random.integers(0, 256, (3600, 3)).tolist()
+    hidden = [
+        struct.pack("<Q3d3BdQ", 1000 + k, *place, *color, 0.1, 0)  # observed by none of the views
+        for k, (place, color) in enumerate(zip(places, colors, strict=True))
+    ]
+    file.write_bytes(struct.pack("<Q", len(world.points) + 3600) + file.read_bytes()[8:] + b"".join(hidden))
+    report = check(tmp_path)
+    assert report.problems == [] and report.suggestion is None
+    assert report.colour_correlation is not None and report.colour_correlation > 0.9

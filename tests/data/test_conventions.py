@@ -159,3 +159,12 @@ def test_check_warns_of_uneven_exposures(world: World, tmp_path: Path) -> None:
     report = check(tmp_path)
     assert any("(pano_02); train with train.exposures=learned" in note for note in report.notes), report.notes
     assert report.problems == [] and any("exposures      differ by a factor of 1." in line for line in lines(report))
+
+
+def test_a_dark_room_is_no_dark_exposure(world: World) -> None:
+    images, seen = torch.from_numpy(np.stack(world.images)), torch.zeros(6, 400, dtype=torch.bool)
+    images[3:] = images[3:] // 3
+    seen[:3, :200] = seen[3:, 200:] = True  # two rooms
+    points = torch.from_numpy(world.points)
+    assert exposure_gains(_poses(world), images, points).std() > 0.5
+    assert exposure_gains(_poses(world), images, points, seen).std() < 0.1

@@ -95,6 +95,8 @@ def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepa
     if destination.name and os.path.ismount(destination):
         raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
+        if destination.is_dir() and destination.samefile(Path()):
+            raise DataError(f"{destination} is the working folder, which is not replaced; name a new folder in it")
         return None
     if result := work.find_result(source, destination, options):
         return result

@@ -5,6 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -56,11 +57,13 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     """
     seen = set[bytes]()
     for frame in _sharpest(video, per_second, progress):
-        digest = hashlib.sha256(frame.tobytes()).digest()
+        written = BytesIO()
+        Image.fromarray(frame).save(written, "JPEG", quality=95, subsampling=0)
+        digest = hashlib.sha256(written.getvalue()).digest()
         if digest in seen:  # of a still, or of a title that comes again
             continue
         seen.add(digest)
-        Image.fromarray(frame).save(folder / f"frame_{len(seen):05d}.jpg", quality=95, subsampling=0)
+        (folder / f"frame_{len(seen):05d}.jpg").write_bytes(written.getvalue())
     if len(seen) < 2:
         what = f"{video} gives {len(seen)} different frames at {per_second:g} a second; poses need at least two"
         raise DataError(f"{what}: take more a second (`--per-second`), or a longer video")

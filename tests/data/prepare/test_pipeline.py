@@ -4,13 +4,16 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from typer.testing import CliRunner
 
 import padgs.data
+from padgs.cli.commands import app
 from padgs.data import DataError
 from padgs.data.camera_paths import gravity, path_length
 from padgs.data.check import check
@@ -364,3 +367,22 @@ def test_accurate_mode_finds_exact_poses(scene, tmp_path):
     assert len(distance) == VIEWS
     assert distance.max() < 4e-3
     assert degrees.max() < 0.08
+
+
+def test_the_working_folder_is_not_replaced(tmp_path, monkeypatch):
+    source = noise(tmp_path / "in")
+    (tmp_path / "flat").mkdir()
+    monkeypatch.chdir(tmp_path / "flat")
+    with pytest.raises(DataError, match="flat is the working folder, which is not replaced; name a new folder in it"):
+        prepare(source, Path.cwd())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flat", "in"]
+
+
+def test_an_interrupted_first_step_is_not_said_to_continue(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "extract_frames", interrupt)
+    (tmp_path / "tour.mp4").write_bytes(b"a film")
+    done = CliRunner().invoke(app, ["prepare", str(tmp_path / "tour.mp4"), str(tmp_path / "flat")])
+    assert "the same command starts over" in done.stderr and not (tmp_path / ".flat.prepare").exists()

@@ -373,3 +373,12 @@ def test_a_missing_mask_of_a_video_is_refused_before_it_is_decoded(tmp_path):
     (tmp_path / "tour.mp4").write_bytes(b"a film")
     with pytest.raises(DataError, match="--mask absent.png: no such file or folder"):
         fingerprint(tmp_path / "tour.mp4", PrepareOptions(mask="absent.png"))
+
+
+def test_frames_that_are_equal_as_files_are_written_once(tmp_path, monkeypatch):
+    still, moved = np.full((16, 32, 3), 100, np.uint8), np.full((16, 32, 3), 9, np.uint8)
+    nearly = still.copy()
+    nearly[5, 5] = 101  # less than a step of the JPEG
+    monkeypatch.setattr(sources, "_sharpest", lambda *_: iter([still, nearly, moved]))
+    assert extract_frames(tmp_path / "a.mp4", tmp_path, 1.0) == 2
+    assert len(find_source(tmp_path, "auto").images) == 2
