@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -23,7 +22,7 @@ from padgs.apps import external
 from padgs.apps.export.explicit import transform_splats
 from padgs.apps.export.splat_file import read_splats, write_splats
 from padgs.apps.external import RAYS, ExternalMethod, ExternalRun, open_model, program_of
-from padgs.apps.frame_check import FrameCheck, _closest_points, _worlds, as_numbers, check_frame, read_transform
+from padgs.apps.frame_check import as_numbers, check_frame, read_transform
 from padgs.cli.commands import app
 from padgs.data.capture import DataError
 from padgs.data.perturb import StressOptions
@@ -34,7 +33,6 @@ from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.similarity import Similarity
 from padgs.methods.splats.splats import Splats
 from padgs.reports import store
-from padgs.scene import Scene
 
 TURN = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
 MOVED = Similarity(1.7, TURN, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64))
@@ -168,14 +166,6 @@ def test_nerfstudio_s_world_is_suggested(run, splats, tmp_path):
     assert as_numbers(given) == as_numbers(found.suggestion)
 
 
-def test_a_faulty_file_of_nerfstudio_s_world_is_named(tmp_path):
-    file = tmp_path / "dataparser_transforms.json"
-    file.write_text(json.dumps({"transform": torch.eye(4)[:3].tolist()}))
-    with pytest.raises(ValueError, match="scale") as raised:
-        read_transform(str(file))
-    assert not isinstance(raised.value, DataError) and "is no file" not in str(raised.value)
-
-
 def test_a_single_gaussian_is_seen_from_before_it(tmp_path):
     one = Splats(torch.tensor([[3.0, 4, 5]]), torch.full((1, 3), -2.0), torch.ones(1, 3), degree=0, opacity=0.9)
     write_splats(tmp_path / "one.ply", one)
@@ -210,63 +200,6 @@ def test_files_of_a_data_set_in_map_coordinates_are_read_in_any_of_its_worlds(tm
                 str(tmp_path / name), str(tmp_path / "data"), transform=as_numbers(found.suggestion), device="cpu"
             )
             assert again.check().psnr == pytest.approx(found.suggested_psnr, abs=0.5)
-
-
-def test_points_are_aligned_from_another_scale_and_place(generator):
-    points = torch.randn(800, 3, generator=generator, dtype=torch.float64) * torch.tensor([3.0, 2.0, 1.0])
-    near = Similarity(1.0, torch.from_numpy(Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix()), torch.zeros(3))
-    start = Similarity(0.0, near.rotation @ MOVED.rotation.mT, torch.zeros(3))
-    distance, found = _closest_points(points, MOVED(points), start, 800, 60)
-    assert distance < 1e-6 and torch.allclose(found(MOVED(points)), points, atol=1e-6)
-
-
-def test_transforms_are_read_and_combined(tmp_path):
-    points = torch.randn(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = MOVED.scale * MOVED.rotation.numpy(), MOVED.translation.numpy()
-    np.save(tmp_path / "a.npy", matrix)
-    (tmp_path / "a.json").write_text(json.dumps(matrix.tolist()))
-    np.savetxt(tmp_path / "a.txt", matrix)
-    lines = (tmp_path / "a.txt").read_text()
-    (tmp_path / "bom.txt").write_text(lines, encoding="utf-8-sig")  # Notepad
-    (tmp_path / "wide.txt").write_text(lines, encoding="utf-16")  # PowerShell
-    (tmp_path / "B.JSON").write_text(json.dumps(matrix.tolist()), encoding="utf-16")
-    files = ("a.npy", "a.json", "a.txt", "bom.txt", "wide.txt", "B.JSON")
-    for text in (as_numbers(MOVED), *(str(tmp_path / file) for file in files)):
-        assert torch.allclose(read_transform(text)(points), MOVED(points), atol=1e-5)
-    assert torch.allclose(read_transform("identity")(points), points)
-    other = Similarity(translation=torch.tensor([1.0, 2, 3]).double())
-    assert torch.allclose((MOVED @ other)(points), MOVED(other(points)))
-
-
-@pytest.mark.parametrize(
-    ("text", "rule"),
-    [
-        ("nowhere.json", "is no file and no 12 or 16 numbers"),
-        ("1 2 3", "is no file and no 12 or 16 numbers"),
-        ("1 0 0 0 0 1 0 0", "has 8 numbers"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0", "is a mirror image"),
-        ("1 0 0 0 0 2 0 0 0 0 1 0", "shears, or scales axes differently"),
-        ("0 0 0 0 0 0 0 0 0 0 0 0", "shears, or scales axes differently"),
-        ("1 0 0 nan 0 1 0 0 0 0 1 0", "must be a rotation times a scale"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1", "the last one 0 0 0 1"),
-        (" ".join(["1.0000000000000000"] * 16), "the last one 0 0 0 1"),  # longer than a name of a file may be
-    ],
-)
-def test_other_transforms_are_refused(text, rule):
-    with pytest.raises(ValueError, match=rule):
-        read_transform(text)
-
-
-def test_gaussians_in_one_place_are_not_aligned_to_points():
-    scene = Scene("", (), (), torch.randn(50, 3), torch.zeros(50, 3), "")
-    assert {words for words, _ in _worlds(scene, torch.ones(3, 3), None)} == {"with other axes"}
-
-
-def test_an_empty_file_is_no_transform(tmp_path):
-    (tmp_path / "a.npy").touch()
-    with pytest.raises(ValueError, match="is no file and no 12 or 16 numbers"):
-        read_transform(str(tmp_path / "a.npy"))
 
 
 @pytest.mark.parametrize(
@@ -331,10 +264,6 @@ def test_one_matrix_is_one_transform_however_it_is_written(splats, tmp_path):
 def test_a_data_set_with_a_config_of_its_own_is_no_run(tmp_path):
     (tmp_path / "config.yaml").write_text("processes: 4\n")  # of OpenSfM
     assert external.config_of(str(tmp_path), format="opensfm").data.format == "opensfm"
-
-
-def test_views_of_one_colour_tell_nothing_about_the_world():
-    assert str(FrameCheck(math.inf, 0.0)).endswith("so the world of the file cannot be checked")
 
 
 def test_viewers_widen_by_pixels_of_the_image_that_they_draw(splats):

@@ -41,7 +41,7 @@ def test_columns_of_3dgs(tmp_path, generator):
 
 
 def test_colours_in_place_of_harmonics_are_read(tmp_path, generator):
-    """As of `ns-export gaussian-splat --ply-color-mode rgb`."""
+    """Files of `ns-export gaussian-splat --ply-color-mode rgb`."""
     splats = random_splats(0, generator)
     write_splats(tmp_path / "a.ply", splats)
     table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
