@@ -48,7 +48,8 @@ class DataConfig(DataSettings):
     @property
     def synthetic(self) -> SyntheticOptions:
         """Options of a generated scene; a ConfigError names an unknown key or a value of the wrong type."""
-        width = {"width": self.width} if self.width is not None and self.path is None else {}
+        is_generated = self.path is None or self.format == "synthetic"
+        width = {"width": self.width} if is_generated and self.width is not None else {}
         return typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
 
     def options(self, device: str) -> DataOptions:

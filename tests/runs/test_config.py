@@ -112,5 +112,6 @@ def test_every_number_has_limits(method):
 
 def test_the_width_of_a_capture_is_not_that_of_a_generated_scene():
     assert DataConfig(path="x", format="auto", width=12288).options("cpu").width == 12288
+    assert DataConfig(path="x", format="synthetic", width=64).synthetic.width == 64
     with pytest.raises(ValueError, match="are 2.3 billion pixels"):
         DataConfig(width=12288)
