@@ -65,14 +65,19 @@ def check_place(path: Path) -> None:
         draft.touch()
 
 
+def refuse_working_folder(path: Path) -> None:
+    """Raise a ValueError for the working folder or a root, which nothing can replace."""
+    if not path.name or (path.is_dir() and path.samefile(Path())):
+        raise ValueError(f"{path} is the working folder or a root, which is not replaced; name a new one")
+
+
 @contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
     """Yield a hidden path beside `path` for a file or folder; what is there at the end is removed.
 
     Drafts that killed processes left in this folder, and that have not changed for a day, are removed first.
     """
-    if not path.name:
-        raise ValueError(f"{path} is the working folder or a root, which is not replaced; name a new one")
+    refuse_working_folder(path)
     with suppress(OSError):
         for left in path.parent.glob(f"{DRAFT}*"):
             if time.time() - left.lstat().st_mtime > DAY:

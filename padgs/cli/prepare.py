@@ -53,6 +53,7 @@ def prepare(
     from padgs.cli.check import end_with, overlay_path
     from padgs.data.check import check
     from padgs.data.metres import KnownLength
+    from padgs.data.prepare.pipeline import place_of
     from padgs.data.prepare.pipeline import prepare as find_poses
     from padgs.data.prepare.work import PrepareOptions
 
@@ -67,7 +68,7 @@ def prepare(
             result = find_poses(Path(source), target, options, tell)
             report = check(target, overlay=overlay_path(target))
     except KeyboardInterrupt as interrupt:
-        is_kept = target.exists() or target.with_name(f".{target.name}.prepare").is_dir()
+        is_kept = target.exists() or place_of(target).is_dir()
         way_on = "continues" if is_kept else "starts over: its first step was not complete"
         raise Interrupted(f"interrupted; the same command {way_on}") from interrupt
     placed = len(result.registered)

@@ -33,6 +33,7 @@ from padgs.data.prepare.pairs import image_pairs, similarities
 from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
 from padgs.data.prepare.work import Prepared, PrepareOptions, WorkFolder, digest_of
 from padgs.data.scans import optional_module
+from padgs.files import refuse_working_folder
 from padgs.geometry.similarity import Similarity
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
@@ -61,7 +62,7 @@ def prepare(
         return result
     if destination.name in (*IMAGE_FOLDERS, *MASK_FOLDERS) and destination.resolve().parent == source.resolve():
         raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
-    place = destination.absolute().with_name(f".{destination.name}.prepare")
+    place = place_of(destination.absolute())
     lock = FileLock(place / work.LOCK)
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -90,13 +91,17 @@ def prepare(
         lock.release()
 
 
+def place_of(destination: Path) -> Path:
+    """Return the hidden folder for intermediate results, beside the destination."""
+    return destination.with_name(f".{destination.name}.prepare")
+
+
 def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
     """Return the result of an earlier call; None if the destination is free, a DataError if something else is there."""
     if destination.name and os.path.ismount(destination):
         raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
-        if destination.is_dir() and destination.samefile(Path()):
-            raise DataError(f"{destination} is the working folder, which is not replaced; name a new folder in it")
+        refuse_working_folder(destination)
         return None
     if result := work.find_result(source, destination, options):
         return result

@@ -262,6 +262,8 @@ def test_convert_refuses_invalid_calls(world: World, tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path / "empty")
     with pytest.raises(ValueError, match=r"\. is the working folder or a root, which is not replaced; name a new one"):
         convert(tmp_path / "in", Path(), "colmap")
+    with pytest.raises(ValueError, match=r"empty is the working folder or a root, which is not replaced"):
+        convert(tmp_path / "in", Path.cwd(), "colmap")
     (tmp_path / "empty").rmdir()
     with pytest.raises(ValueError, match="unknown format 'ply'; known: colmap, transforms"):
         convert(tmp_path / "in", tmp_path / "out", "ply")

@@ -373,7 +373,7 @@ def test_the_working_folder_is_not_replaced(tmp_path, monkeypatch):
     source = noise(tmp_path / "in")
     (tmp_path / "flat").mkdir()
     monkeypatch.chdir(tmp_path / "flat")
-    with pytest.raises(DataError, match="flat is the working folder, which is not replaced; name a new folder in it"):
+    with pytest.raises(ValueError, match="flat is the working folder or a root, which is not replaced; name a new one"):
         prepare(source, Path.cwd())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flat", "in"]
 
