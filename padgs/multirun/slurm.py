@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 SECONDS_BETWEEN_QUERIES = 10.0
-NO_ANSWER = re.compile(r"unable to contact|temporarily|try again", re.IGNORECASE)  # and nothing was submitted
+NO_ANSWER = re.compile(r"unable to contact|temporarily|try again|timed out", re.IGNORECASE)  # and nothing was submitted
 TOO_MANY = re.compile(r"array|limit", re.IGNORECASE)  # of MaxArraySize, a QOS or an account
 
 

@@ -90,6 +90,7 @@ class Multirun:
         self.runs = Path(config.run.folder)
         self.board = Board(Path(config.hydra.sweep.dir))
         self._in_process = not in_own_process(config.hydra)
+        self._die_together = "joblib" in str(config.hydra.launcher._target_)  # all jobs with one
         self._console, self._say, self._finished = console, partial(say, console), FinishedJobs(self.runs)
         if config.retry not in RETRIES:
             raise ValueError(unknown("retry", config.retry, RETRIES))
@@ -125,12 +126,16 @@ class Multirun:
                 self._end(waiting.pop(), JobState(Status.REFUSED, reason=reason))
         while waiting:
             size = 1 if self._in_process else batch_size or len(waiting)
+            if self._die_together:  # any of these may be the cause: they go on alone, after the others
+                waiting.sort(key=lambda index: attempts[index])
+                size = min(size, sum(not attempts[index] for index in waiting)) or 1
             batch, waiting = waiting[:size], waiting[size:]
             self._numbers |= {index: launched + position for position, index in enumerate(batch)}
             error = self._launch(launcher, [self.jobs[index] for index in batch], launched)
             launched += len(batch)
             self._follow(batch)
-            is_silent = isinstance(error, SubmissionRefused) and NO_ANSWER.search(str(error))
+            is_full = bool(TOO_MANY.search(str(error))) and len(batch) == 1  # until other jobs of the user have ended
+            is_silent = isinstance(error, SubmissionRefused) and (is_full or NO_ANSWER.search(str(error)))
             if is_silent and retries < RETRIES_OF_SLURM and not self.board.stop_requested():
                 waiting, retries = batch + waiting, retries + 1
                 self._say(f"{error}; tried again in {SECONDS_BETWEEN_RETRIES:g} s")

@@ -266,7 +266,7 @@ def scene_choices() -> dict[str, dict[str, Any]]:
 
 
 def choose_device(name: str, render: RenderConfig, *, strict: bool = False) -> torch.device:
-    """Return the device for `run.device`; auto: a GPU that can render, or the CPU (`strict`: if there is none)."""
+    """Return the device for `run.device`; auto: a GPU that can render, or the CPU (`strict`: if it is asked for)."""
     if (name == "cuda" or render.backend == "cuda") and not torch.cuda.is_available():
         why = "torch finds no GPU with a working driver" if torch.version.cuda else "this torch is built without CUDA"
         wish, way_out = ("run.device", "cpu or auto") if name == "cuda" else ("render.backend", "auto, cpu or torch")
@@ -275,6 +275,8 @@ def choose_device(name: str, render: RenderConfig, *, strict: bool = False) -> t
         if name == "cpu":
             raise ValueError("render.backend=cuda renders on a GPU only, not with run.device=cpu; set run.device=auto")
         cuda.library()
+    if strict and name == "auto" and render.backend == "auto" and not torch.cuda.is_available():
+        raise ValueError("Slurm gave this job a GPU, but torch finds none: correct that, or set run.device=cpu")
     if not torch.cuda.is_available() or name == "cpu":
         return torch.device("cpu")
     gpu = torch.device("cuda", torch.cuda.current_device())

@@ -164,6 +164,35 @@ def test_a_queue_that_is_full_or_silent_for_a_while_is_used_again(tmp_path, monk
     assert lost.counts() == {"refused": 3} and len(lost.limits) == 99 - sweep.RETRIES_OF_SLURM
 
 
+@pytest.mark.parametrize("reason", ["QOSMaxSubmitJobPerUserLimit", "Socket timed out on send/recv operation"])
+def test_a_queue_that_takes_no_job_for_a_while_is_tried_again(tmp_path, monkeypatch, reason):
+    monkeypatch.setattr(sweep, "SECONDS_BETWEEN_RETRIES", 0)
+    start = Refusing(tmp_path, 1, ELSEWHERE)
+    limits = [0, 0, 0, 0, 9, 9]
+    type(start).most = property(lambda self: limits.pop(0))
+    start.reason = reason
+    try:
+        assert start.counts() == {"ok": 3}
+    finally:
+        del type(start).most
+
+
+class OutOfMemory(Start):
+    """The system kills the process of seed 1, and joblib all others with it."""
+
+    def launch(self, jobs, initial_job_idx):
+        self.launched.append([job[0][-1] for job in jobs])
+        for number, (job,) in enumerate(jobs, initial_job_idx):
+            self.board.write(number, JobState("running")) if ["++seed=1"] in jobs else self.end(number, job)
+        if ["++seed=1"] in jobs:
+            raise RuntimeError("a worker was killed")
+
+
+def test_a_job_that_lacks_memory_takes_no_other_with_it_twice(tmp_path):
+    start = OutOfMemory(tmp_path, 1, ELSEWHERE)
+    assert start.counts() == {"ok": 2, "killed": 1} and start.launched == [["0", "1", "2"], ["0"], ["1"], ["2"]]
+
+
 class Preempted(Start):
     def end(self, number, job):
         self.board.write(number, JobState("stopped", reason="stopped after iteration 5"))

@@ -22,6 +22,9 @@ def with_gpu(monkeypatch):
 def test_without_a_gpu_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_device("auto", RenderConfig()) == choose_device("cpu", RenderConfig()) == torch.device("cpu")
+    with pytest.raises(ValueError, match="Slurm gave this job a GPU, but torch finds none.*run.device=cpu"):
+        choose_device("auto", RenderConfig(), strict=True)
+    assert choose_device("cpu", RenderConfig(), strict=True).type == "cpu"
     with pytest.raises(ValueError, match="run.device=cuda, but .*set run.device=cpu or auto"):
         choose_device("cuda", RenderConfig())
 
