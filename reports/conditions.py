@@ -6,7 +6,7 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.files import file_name
-from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, by_conditions
+from padgs.reports.frame import CONFIG, PUBLISHED_ITERATIONS, by_conditions, grouped
 from padgs.reports.measures import PROTOCOL_METRICS
 from padgs.reports.methods import name, title
 from padgs.reports.selection import Mixture, Request
@@ -75,6 +75,10 @@ def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
     for block, runs in blocks.items():
         titles.setdefault(_sentence(runs, protocols), []).append(block)
     notes = [f"{'; '.join(of)}: {sentence}" for sentence, of in titles.items()]
+    for block, runs in blocks.items():
+        same = grouped(runs, "preset", "variant", "setting")
+        if mixed := sorted({title(of[0]) for of, own in same if own["code_version"].nunique() > 1}):
+            notes.append(f"{block}: seeds of {', '.join(mixed)} are of several versions of padgs.")
     made = {(of, by) for own in blocks.values() for of, by in zip(own["preset"], own["external"], strict=True) if by}
     notes += [f"{title(of)}: made by {by}, and only scored by padgs." for of, by in sorted(made)]
     for method, length in PUBLISHED_LENGTHS.items():

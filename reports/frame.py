@@ -37,6 +37,7 @@ WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a
 # Options that results of before they existed, or since they ended (hold_out), do not name, and what those runs did.
 BEFORE = {"method.length_unit": "extent", "method.means_least_pace": 1.0, "train.random_background": False}
 BEFORE |= {"train.hold_out": None, "render.steepness": 0.0}
+OF_A_SCENE = ("data.", "method.sha256", "method.transform")  # beginnings of keys
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
@@ -178,11 +179,19 @@ def setting(config: Mapping[str, Any]) -> str:
 
 
 def without_data(runs: DataFrame) -> DataFrame:
-    """Return runs whose settings are compared without those of their data, for means over scenes."""
-    kept = [json.loads(text).items() for text in runs["setting"]]
-    of_methods = [setting({key: value for key, value in own if not key.startswith("data.")}) for own in kept]
-    columns = [column for column in runs if column.startswith(f"{CONFIG}data.")]
-    return runs.drop(columns=columns).assign(setting=of_methods)
+    """Return runs whose settings are compared without those of their data, for means over scenes.
+
+    Models of other programs are a file for each scene, and voxels that a data set states are of its units.
+    """
+    kept, voxels = [json.loads(text) for text in runs["setting"]], f"{CONFIG}method.voxel_size"
+    for own in kept:
+        if own.get("method.voxel_size") == own.get("data.voxel_size"):
+            own.pop("method.voxel_size", None)
+    of_methods = [{key: value for key, value in own.items() if not key.startswith(OF_A_SCENE)} for own in kept]
+    columns = [column for column in runs if column.removeprefix(CONFIG).startswith(OF_A_SCENE)]
+    if voxels in runs and not any("method.voxel_size" in own for own in of_methods):
+        columns.append(voxels)
+    return runs.drop(columns=columns).assign(setting=[*map(setting, of_methods)])
 
 
 def _hardware(result: Result) -> str:

@@ -18,7 +18,7 @@ from padgs.reports.table import Table
 
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
-SPECIAL |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"}
+SPECIAL |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''"}
 SPECIAL |= {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
 SPECIAL |= {"†": r"\dag{}", "τ": r"$\tau$", "δ": r"$\delta$", "√": r"$\surd$"}
 LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}

@@ -168,7 +168,8 @@ def set_axis(axis: Any, values: Sequence[float], logarithmic: bool = False, wors
     name = axis.axis_name
     axis.axes.set(**{f"{name}scale": "log" if logarithmic else "linear", f"{name}lim": ends})
     decades = logarithmic and ends[1] >= 3 * ends[0]
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if decades else MaxNLocator(6, steps=[1, 2, 5, 10]))
+    subs = (1.0, 2.0, 5.0) if ends[1] >= 10 * ends[0] else (1.0, 2.0, 3.0, 5.0, 7.0)
+    axis.set_major_locator(LogLocator(subs=subs) if decades else MaxNLocator(6, steps=[1, 2, 5, 10]))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(EngFormatter(sep="") if ends[1] >= 1e4 else "{x:g}")
     return ends

@@ -81,7 +81,7 @@ def draw(trade_off: TradeOff, shown: Sequence[Cost] = ()) -> tuple[Any, list[tup
     presets = [point.preset for point in trade_off.points]
     apart = unranked(trade_off.runs)
     for panel, own, (cost, words, unit) in zip(axes.flat, marks, shown, strict=True):
-        panel.set_xlabel(f"{words}, {unit} ↓")
+        panel.set_xlabel(f"{words}, {unit}, log scale ↓")
         panel.set_ylabel(f"{quality.column.title}, dB ↑")
         set_axis(panel.xaxis, [mark.x for mark in own], True, worse=1)
         set_axis(panel.yaxis, [mark.y for of in marks for mark in of], worse=-1)

@@ -5,7 +5,7 @@ import io
 from dataclasses import replace
 
 import pytest
-from support.made_up import RULES, builder, data_set, failed, result, run_set
+from support.made_up import RULES, builder, data_set, external, failed, result, run_set
 
 from padgs.reports.table import MISSING, ReportError, Table
 from padgs.reports.writers import csv_text, latex, markdown
@@ -140,6 +140,21 @@ def test_any_scenes_have_a_mean_and_nothing_of_the_paper_unless_its_data_sets_we
     for build in (table1, table2, table3, table4, builder("methods")):
         text = markdown(build(run_set(mine)))
         assert not any(word in text for word in ("paper ", "Δ", "360Roam", "Ricoh360", "3090", "of the paper"))
+    own = []  # voxels in the units of each scene, and a file of another program for each
+    for run in mine:
+        size = 0.01 if run.scene == "my_bar" else 0.02
+        config = {**run.config, "data": {"voxel_size": size}, "method": {"voxel_size": size}}
+        own.append(replace(run, config=config))
+        model = {"method": {"sha256": run.scene}, "train": {"learning_rates": "run"}}
+        if run.method == "padgs" and run.seed == 0:
+            more = {"scene": run.scene, "dataset": "", "fingerprint": run.fingerprint, "width": 2048, "height": 1024}
+            more["scores"] = run.scores
+            made = external(30.0, "Brush", config=model, **more)
+            own.append(replace(made, run=f"brush_{run.scene}", preset="brush"))
+    found = cells(table1(run_set(own)))
+    title = "Average over 2 scenes: my_bar, my_lab"
+    assert float(found[title, "PaD-GS", "PSNR", "PSNR"]["value"]) == pytest.approx(24.55)
+    assert float(found[title, "Brush (external)", "PSNR", "PSNR"]["value"]) == pytest.approx(24.5)
     sizes = [*mine, *(replace(run, scene="wide", width=4096, height=2048, run=f"w{run.run}") for run in mine[:4])]
     table = table1(run_set(sizes))
     assert "No mean over the scenes: " in "".join(table.notes) and len(table.blocks) == 3
@@ -296,6 +311,13 @@ def test_footnotes_name_the_conditions(build, made):
     for words in ("paper, LPIPS-vgg fed \\[0, 1\\]", "2048x1024", "30000 iterations", "0.1.0 abc", "2 cores of A & B"):
         assert words in note
     assert "seeds 0" in note and ("RTX 3090" in text)
+
+
+def test_a_footnote_names_rows_whose_seeds_are_of_several_versions():
+    made = [replace(run, code_version=f"0.1.{run.seed}") for run in data_set("roam360", seeds=2) if run.scene == "bar"]
+    note = "360Roam, bar: seeds of OmniGS, corrected, PaD-GS are of several versions of padgs."
+    assert note in table1(run_set(made)).notes
+    assert not any("several versions" in one for one in table1(run_set(data_set("roam360", seeds=2))).notes)
 
 
 def test_the_best_of_each_column_is_bold_by_its_own_direction():

@@ -67,6 +67,13 @@ def test_an_axis_contains_its_values_and_has_ticks(known, logarithmic):
     assert sum(low <= tick <= high for tick in axes[0, 0].get_yticks()) >= 2
 
 
+def test_a_logarithmic_axis_of_less_than_a_decade_has_enough_ticks():
+    made, axes = figure(1, 1)
+    low, high = set_axis(axes[0, 0].xaxis, [27.7, 94.4], logarithmic=True)
+    made.draw_without_rendering()
+    assert [tick for tick in axes[0, 0].get_xticks() if low <= tick <= high] == pytest.approx([30, 50, 70, 100])
+
+
 def test_no_value_lies_on_the_edge_of_an_axis():
     made, axes = figure(1, 1)
     known = [18.9, 22.4, 27.1, 31.3, 33.2, 40.8, 46.8, 97.0, 111.4]

@@ -86,14 +86,14 @@ def test_bars_are_the_spread_of_seeds():
 def test_a_chart_names_its_marks_and_axes():
     (made,) = charts(run_set(compared(["synthetic-room"])))
     assert ">PaD-GS<" in made.svg
-    assert ">time per frame, ms ↓<" in made.svg and made.png.startswith(b"\x89PNG")
+    assert ">time per frame, ms, log scale ↓<" in made.svg and made.png.startswith(b"\x89PNG")
 
 
 def test_after_equal_time_only_the_time_per_frame_is_a_cost():
     runs = at_equal_time("synthetic-room")
     (made,) = equal_time_charts(run_set(runs))
     assert made.name == "equal_time_synthetic-room_512x256_60-s-of-CPU-time" and len(made.figure.axes) == 1
-    assert ">time per frame, ms ↓<" in made.svg and equal_time_charts(run_set(runs[:2])) == []
+    assert ">time per frame, ms, log scale ↓<" in made.svg and equal_time_charts(run_set(runs[:2])) == []
 
 
 def test_the_mean_over_scenes_after_equal_time_comes_first():
