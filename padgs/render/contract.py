@@ -2,7 +2,7 @@
 
 All backends match the definition in values and gradients. Each Gaussian that is not culled acts on a pixel through a
 squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-f(q) / 2)), where f(q) = q unless
-`response` has a steepness; pairs with alpha < 1/255 are skipped. Gaussians are blended front to back by the radial
+`kernel` has a steepness; pairs with alpha < 1/255 are skipped. Gaussians are blended front to back by the radial
 distance of their mean (ties by index), and a pixel stops *before* the Gaussian that would bring its transmittance below
 1e-4. Where alpha is limited to 0.99 its derivative is 0.
 Means nearer than 1e-15 or farther than 1e15 world units are culled too: float32 cannot represent their squares.
@@ -56,7 +56,7 @@ class RenderOptions:
     # n x n samples a pixel, which is their mean; `low_pass` is then in square samples
     supersampling: int = 1
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
-    # s in [0, 1) of `response`, tangent and ray; 0: Gaussians; more: flatter in the middle, with a steeper edge
+    # s in [0, 1) of `kernel`, tangent and ray; 0: Gaussians; more: flatter in the middle, with a steeper edge
     steepness: float = 0.0
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none
     cubemap: bool = False  # render a panorama from the six faces of a cube, each a perspective view
@@ -153,7 +153,7 @@ class Removals:
     peak: Tensor  # [N] in [0, 1], largest alpha T of any pixel
 
 
-def response(q: Tensor, steepness: float) -> Tensor:
+def kernel(q: Tensor, steepness: float) -> Tensor:
     """Return f(q) = (1 - s) q + s q^2 of squared distances, with the steepness s; alpha = opacity exp(-f(q) / 2).
 
     1 at one standard deviation, whatever s is. Cf. the generalized exponentials of GES (Hamdi et al. 2024).

@@ -13,7 +13,7 @@ from torch import Tensor
 from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render import projection
-from padgs.render.contract import ALPHA_MIN, Request, largest_q, response
+from padgs.render.contract import ALPHA_MIN, Request, kernel, largest_q
 from padgs.render.projection import Footprints
 
 PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, for every image size
@@ -40,7 +40,7 @@ class TangentFootprints(Footprints):
             first_column, end_column, first_row, end_row = self.boxes[indices].unbind(-1)
             u, v = columns[:, None], rows[:, None]
             inside = inside & (u >= first_column) & (u < end_column) & (v >= first_row) & (v < end_row)
-        return response((offsets * offsets).sum(-1), self.steepness), inside
+        return kernel((offsets * offsets).sum(-1), self.steepness), inside
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RayFootprints(Footprints):
         """Return f(q), q = |o - t w|^2, o = M^-1 mean, w = M^-1 d, and t = o.w / w.w, the distance of the maximum."""
         o, w, t = self._maximum(indices, rows, columns)
         offset = o - t[..., None] * w
-        return response((offset * offset).sum(-1), self.steepness), t.detach() > self.near
+        return kernel((offset * offset).sum(-1), self.steepness), t.detach() > self.near
 
     def distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """Return t, the distance of the maximum along the ray."""

@@ -42,7 +42,7 @@ struct Camera {
   float off_panorama;    // of a table: largest angle in radians to the rays of a panorama; < 0: arbitrary rays
   int32_t compensate;    // 1: widening lowers the opacity
   int32_t cull_ellipsoids;  // 1: ray: the whole drawn Gaussian must be beyond near_radius, not only its mean
-  float steepness;          // of the response of projective footprints; see padgs/render/contract.py
+  float steepness;          // of the kernel of projective footprints; see padgs/render/contract.py
 };
 
 // One projected Gaussian as the blender reads it: a cache line.

@@ -9,7 +9,7 @@ from support.render_cases import draw, gaussians_of, identity_pose, leaves, mixt
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.render.backends import torch as torch_backend
-from padgs.render.contract import largest_q, response
+from padgs.render.contract import kernel, largest_q
 from padgs.scene import View
 
 ENGINE = {"backend": "torch", "dtype": torch.float64}
@@ -45,11 +45,11 @@ def test_the_response_is_flatter_in_the_middle_with_a_steeper_edge(steepness: fl
     """On the horizon at angles of 0.5, 1 and 2 standard deviations; and where alpha falls to 1/255."""
     q = torch.tensor([0.0, 0.25, 1.0, 4.0], dtype=torch.float64)
     expected = [0.0, 0.25 - 0.1875 * steepness, 1.0, 4 + 12 * steepness]
-    assert response(q, steepness).tolist() == pytest.approx(expected, abs=1e-14)
+    assert kernel(q, steepness).tolist() == pytest.approx(expected, abs=1e-14)
     opacities = torch.tensor([0.001, 1 / 255, 0.1, 0.99], dtype=torch.float64)
     reach = largest_q(opacities, steepness)
     assert reach[:2].tolist() == pytest.approx([0, 0], abs=1e-12)
-    assert (opacities[2:] * torch.exp(-0.5 * response(reach[2:], steepness))).tolist() == pytest.approx([1 / 255] * 2)
+    assert (opacities[2:] * torch.exp(-0.5 * kernel(reach[2:], steepness))).tolist() == pytest.approx([1 / 255] * 2)
     mean, size = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.2
     quats, scales = mean.new_tensor([[1, 0, 0, 0]]), mean.new_tensor([[size, size, 1e-6]])
     gaussians = Gaussians(mean, quats, scales, mean.new_tensor([0.8]), mean.new_ones(1, 3))
