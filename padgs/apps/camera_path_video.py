@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import UUID
@@ -47,9 +48,15 @@ XML = (
 )
 
 
+def free_name(path: Path) -> Path:
+    """Return the first of NAME.SUFFIX, NAME-2.SUFFIX, NAME-3.SUFFIX, ... that does not exist."""
+    names = (path.with_stem(f"{path.stem}{'' if number == 1 else f'-{number}'}") for number in count(1))
+    return next(name for name in names if not name.exists())
+
+
 def views_along(
     run: LoadedRun,
-    path: str,
+    path: str | None,
     seconds: float | None,
     fps: float,
     width: int = 0,
@@ -57,11 +64,13 @@ def views_along(
 ) -> list[View]:
     """Return the views of a camera path through the scene of a run; a ValueError if a file is no camera path.
 
-    `path` is a name of PATHS, or a JSON file of keyframes or of nerfstudio; `seconds` None: 10, or the length stored in
-    the file; `width` 0: that of the training views, half of it in perspective. `perspective_shape` is the height in
-    pixels (None: 9/16 of the width) and the horizontal field of view in degrees; None renders panoramas.
+    `path` is a name of PATHS, or a JSON file of keyframes or of nerfstudio; None: `cameras`, or `orbit` if these share
+    one centre. `seconds` None: 10, or the length stored in the file; `width` 0: that of the training views, half of it
+    in perspective. `perspective_shape` is the height in pixels (None: 9/16 of the width) and the horizontal field of
+    view in degrees; None renders panoramas.
     """
     scene, trained = run.scene, run.scene.train[0]
+    path = path or ("orbit" if scene.has_single_center else "cameras")
     if perspective_shape is None:
         width = width or max(4, trained.width // 4 * 4)  # even sides, for videos
         lens: Camera = Panorama(width, width // 2)
@@ -74,9 +83,10 @@ def views_along(
         poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
     else:
         up = gravity(torch.stack([view.cam_from_world for view in scene.panoramas])).up
-        data_set = run.config.data
+        source = transforms_file(run.config.data.path, run.config.data.format)
+        to_data = trained.load_pixels is not None or bool(run.config.options.transform)  # else in the file's own world
         try:
-            poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format), fps=fps)
+            poses = read_path(Path(path), frames, up, source, fps=fps, to_data=to_data)
         except DataError as error:  # which would be taken for one of the run's data
             raise ValueError(str(error)) from error
         poses = move_origin(poses, scene.origin)

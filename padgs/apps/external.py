@@ -38,7 +38,7 @@ from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering
 from padgs.results import LONGEST_NAME, Result, picture_name
-from padgs.runs.config import BudgetOptions, DataConfig, RunConfig, TrainConfig, choose_device
+from padgs.runs.config import DEVICES, BudgetOptions, DataConfig, RunConfig, TrainConfig, choose_device
 from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import Method, initial_result, load_scene
 from padgs.runs.store import Labels, RunStore
@@ -127,8 +127,9 @@ class ExternalRun(LoadedRun):
         `transform` is data_from_file for `read_transform`; empty: the identity. Where the data set has map coordinates,
         from which its scene is shifted, Gaussians nearer to the data's place than to the scene's are shifted too.
         """
-        if rays not in RAYS:
-            raise ValueError(unknown("--rays", rays, RAYS))
+        for option, value, known in (("--rays", rays, RAYS), ("--device", device, DEVICES)):
+            if value not in known:
+                raise ValueError(unknown(option, value, known))
         render, notes = RAYS[rays], list[str]()
         config = None if config is None else replace(config, render=render)
         given = read_transform(transform, config and _transforms_json(config)) if transform else Similarity()
@@ -156,8 +157,9 @@ class ExternalRun(LoadedRun):
             place = given(splats.means.detach().double().median(0).values)
             if (place - origin).norm() < place.norm():
                 world = Similarity(translation=-origin)
-        if transform or world.translation.any():  # at once, because float32 holds no map coordinates
+        if transform or world.translation.any():  # at once and before `float`, because that holds no map coordinates
             splats = transform_splats(splats, world @ given)
+        splats = splats.float()
         if scene is None:
             scene = scene_without_photographs(splats, file, given.rotation).to(choose_device(device, render))
         if rays == "ewa" and (others := [view.name for view in (*scene.train, *scene.test) if view.lens is not None]):
@@ -200,6 +202,7 @@ def open_model(
     `transform` belong to a file, see `ExternalRun.open`; beside a run they are a ValueError.
     """
     given = {"--data": data, "--rays": "" if rays == "exact" else rays, "--transform": transform}
+    given["--device"] = "" if device == "auto" else device
     opened_with = tuple(word for option, value in given.items() if value for word in (option, value))
     if not is_splat_file(path):
         if transform or rays != "exact":

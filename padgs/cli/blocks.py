@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import Depth, Format, Images, Mask, Points, Split, check_range, name_place, show
+from padgs.cli.errors import Depth, Device, Format, Images, Mask, Points, Split, check_range, name_place, show
 
 
 def split(
@@ -43,7 +43,7 @@ def split(
 def merge(
     runs: Annotated[list[str], typer.Argument(help="folders of the finished runs, one of each block")],
     data: Annotated[str, typer.Option(help="folder of the blocks, if it has moved since padgs split")] = "",
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    device: Device = "auto",
 ) -> None:
     """Join the runs of all blocks into one run on the whole data set, scored on all its test views."""
     from rich.console import Console

@@ -20,6 +20,7 @@ Run = Annotated[str, typer.Argument(help="folder of a run, as padgs-run names it
 Model = Annotated[str, typer.Argument(help="folder of a run, or a .ply, .spz, .sog, .splat or .ksplat of Gaussians")]
 Rays = Annotated[str, typer.Option(help="how to draw a file of Gaussians: exact, or ewa as ordinary viewers do")]
 Transform = Annotated[str, typer.Option(help="file's world to the scene's: 12 or 16 numbers, a file, or identity")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda")]
 DataPath = Annotated[str | None, typer.Option("--data", help="data set, if it has moved; for Gaussians also a run")]
 Format = Annotated[str, typer.Option(help="format of the data set; auto: find out")]
 Mask = Annotated[str, typer.Option(help="auto, none, inverted, rows:959/1024, a file or folder; 255 marks used pixels")]
@@ -86,6 +87,7 @@ def as_options(message: str, names: Iterable[str]) -> str:
     'set --mask inverted, or data.width=512'
     """
     known = "|".join(name for name in OF_DATA if name in {*names}) or "(?!)"
+    message = message.replace("run.device=", "--device ")
     return re.sub(rf"data\.({known})\b(=?)", lambda found: f"--{found[1]}{' ' * bool(found[2])}", message)
 
 

@@ -4,18 +4,18 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, check_range, name_place, printable, show
+from padgs.cli.errors import DataPath, Device, Run, check_range, name_place, printable, show
 
 
 def export(
     run: Run,
-    to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
-    upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
+    to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog, .glb or .html")] = "",
+    upright: Annotated[bool, typer.Option("--upright", help="turn a .ply as all others: -y is up in viewers")] = False,
     smooth: Annotated[bool, typer.Option("--smooth", help="include the 3D filter of padgs+, as .html does")] = False,
-    degree_3: Annotated[bool, typer.Option("--degree-3", help="harmonics of degree 3, filled up with zeros")] = False,
     distillation_steps: Annotated[int | None, typer.Option(help="iterations of a fit to renders; default 300")] = None,
     crop: Annotated[str, typer.Option(help="box to keep: lowest and highest x y z, as padgs view shows them")] = "",
     data: DataPath = None,
+    device: Device = "auto",
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply.
 
@@ -31,7 +31,7 @@ def export(
     from rich.text import Text
 
     from padgs.apps.export.explicit import DISTILLATION_STEPS, UNSMOOTHED, export_run
-    from padgs.apps.export.splat_file import check_suffix, write_splats
+    from padgs.apps.export.splat_file import CONVERTED, check_suffix, write_splats
     from padgs.files import check_place
     from padgs.runs.load import load_run
 
@@ -41,21 +41,21 @@ def export(
     check_suffix(path)
     box = _box(crop) if crop else None
     with Console().status("opening the run") as status:
-        trained = load_run(run, data_path=data)
+        trained = load_run(run, data_path=data, device=device)
         with name_place(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             check_place(path)
         found = export_run(
             trained,
             distillation_steps=steps,
-            upright=upright or path.suffix.lower() == ".html",
+            upright=upright or path.name.lower().endswith(CONVERTED),  # a .ply says which axis is up
             smooth=smooth or path.suffix.lower() == ".html",
             crop=box,
             progress=lambda done: status.update(f"distillation step {done} of {steps}"),
         )
         status.update(Text(f"writing {printable(path.name)}"))
         with name_place(path):
-            lost = write_splats(path, found.splats, found.notes, start=found.start, degree_3=degree_3)
+            lost = write_splats(path, found.splats, found.notes, start=found.start)
     notes = [note for note in (*trained.notes, *found.notes, lost) if note and (smooth or note != UNSMOOTHED)]
     show("\n".join(f"  {note}" for note in notes))
     show(f"{path}: {len(found.splats)} Gaussians, {path.stat().st_size / 1e6:.1f} MB")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, show
+from padgs.cli.errors import DataPath, Device, show
 from padgs.results import SMALLEST_LOSSES, SMALLEST_STATED
 
 KNOWN = ", ".join(f"{loss:g}" for loss in SMALLEST_LOSSES)
@@ -14,7 +14,7 @@ def smallest(
     run: Annotated[str, typer.Argument(help="folder of a finished run, as padgs-run names it at its end")],
     epsilon: Annotated[float, typer.Option(help=f"dB that the kept model may lose: {KNOWN}")] = SMALLEST_STATED,
     data: DataPath = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    device: Device = "auto",
 ) -> None:
     """Search for the smallest model that is as good as that of a finished run, and keep it as a run."""
     from rich.console import Console

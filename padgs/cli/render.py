@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Model, Rays, Transform, check_range, name_place, show
+from padgs.cli.errors import DataPath, Device, Model, Rays, Transform, check_range, name_place, show
 
 MAX_SIDE = 16384  # larger images fill the memory
 
@@ -12,7 +12,7 @@ MAX_SIDE = 16384  # larger images fill the memory
 def render(
     run: Model,
     to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; default: video.mp4 in the run's folder")] = "",
-    path: Annotated[str, typer.Option(help="cameras, orbit, dolly, or a JSON of keyframes or nerfstudio")] = "cameras",
+    path: Annotated[str | None, typer.Option(help="cameras (default), orbit, dolly, or a JSON of a path")] = None,
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
     fov: Annotated[float | None, typer.Option(help="horizontal degrees of a perspective image; default 90")] = None,
     width: Annotated[int, typer.Option(help="width in pixels; 0: about the run's, half in perspective")] = 0,
@@ -23,6 +23,7 @@ def render(
     data: DataPath = None,
     rays: Rays = "exact",
     transform: Transform = "",
+    device: Device = "auto",
 ) -> None:
     """Write a video or PNGs along a camera path: 360-degree, which players recognise, or in perspective."""
     import os
@@ -30,7 +31,7 @@ def render(
 
     from rich.console import Console
 
-    from padgs.apps.camera_path_video import depth_unit, views_along, write_video
+    from padgs.apps.camera_path_video import depth_unit, free_name, views_along, write_video
     from padgs.apps.external import open_model
     from padgs.data.formats.path_file import MAX_FRAMES
 
@@ -50,13 +51,13 @@ def render(
             f"at most {MAX_FRAMES / fps:g}"
         )
     with Console().status("opening the run") as status:
-        found = open_model(run, data, rays, transform)
+        found = open_model(run, data, rays, transform, device)
         for note in found.notes:  # they may say that the frames would show nothing
             show(f"  {note}")
         shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
         views = views_along(found, path, seconds, fps, width, shape)
         lens = views[0].camera
-        output = Path(os.path.abspath(to)) if to else found.folder / "video.mp4"
+        output = Path(os.path.abspath(to)) if to else free_name(found.folder / "video.mp4")
         with name_place(output):
             outputs = write_video(
                 output,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from padgs import results
-from padgs.cli.errors import DataPath, Model, Rays, Transform, check_range, show
+from padgs.cli.errors import DataPath, Device, Model, Rays, Transform, check_range, show
 
 if TYPE_CHECKING:
     from padgs.runs.load import LoadedRun
@@ -23,6 +23,7 @@ def view(
     data: DataPath = None,
     rays: Rays = "exact",
     transform: Transform = "",
+    device: Device = "auto",
 ) -> None:
     """Walk through a run in the browser, also while it trains, rendered by its own renderer."""
     from padgs.apps.viewer.server import LOCAL, PORT, has_screen, serve, wait_for_checkpoint
@@ -34,24 +35,23 @@ def view(
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.external import is_splat_file, open_model
 
-        opened.clear()
         files = [folder for folder in folders if is_splat_file(folder)]
         place = data or next((folder for folder in folders if folder not in files), None)
         for folder in folders:
             wait_for_checkpoint(folder)
         for folder in folders:
             stated = (rays, transform) if folder in files or not files else ()  # a run beside a file has its own
-            opened.append(open_model(folder, place if folder in files else data, *stated))
+            opened.append(open_model(folder, place if folder in files else data, *stated, device=device))
             for note in opened[-1].notes:
                 show(f"  {note}")
         if len(names := [*dict.fromkeys(found.scene.name for found in opened)]) > 1:
             raise ValueError(f"{run} and {beside} are of two scenes, {' and '.join(names)}; name two runs of one scene")
         return opened
 
-    if not all(Path(folder).is_file() or (Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
+    if not all((Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
         of_one_scene()  # raises before the page is served
     try:
-        serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
+        serve(lambda: opened or of_one_scene(), host=host or LOCAL, port=port or PORT, browse=has_screen())
     except KeyboardInterrupt:  # the way to end it
         command = shlex.join(["padgs", "render", run, *(opened[0].opened_with if opened else ())])
         show(f"next: {command}  (--path film.json after saving a film)")

@@ -1,6 +1,7 @@
 """Camera-path videos: encoding, spherical metadata, and `padgs render`."""
 
 import json
+import shutil
 import struct
 from types import SimpleNamespace
 
@@ -164,6 +165,16 @@ def test_written_depths_can_be_read_as_depth_maps(tmp_path):
 def test_invalid_options_are_refused(arguments, message, folder, tmp_path):
     result = render(str(folder), *arguments, "--to", str(tmp_path / "frames"))
     assert result.exit_code == 1 and message in " ".join((result.output + result.stderr).split())
+
+
+@WITH_VIDEO
+def test_a_video_without_a_name_replaces_none(folder, tmp_path):
+    run = shutil.copytree(folder, tmp_path / "run")
+    (run / "video.mp4").write_text("of the camera")
+    for number in (2, 3):
+        done = render(str(run), "--seconds", "0.1", "--fps", "20")
+        assert done.exit_code == 0 and f"video-{number}.mp4: 2 frames" in " ".join(done.output.split()), done.output
+    assert (run / "video.mp4").read_text() == "of the camera"
 
 
 def test_a_folder_with_images_is_refused(folder, tmp_path):

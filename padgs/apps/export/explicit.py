@@ -149,7 +149,7 @@ def _as_gaussians(run: LoadedRun, splats: Splats, steps: int, progress: Callable
         world = run.method.world
         return splats if world is None else transform_splats(splats, world.inverse()), "Gaussians of equal area"
     splats, loss = _fitted(run, splats, replace(config, steepness=0.0, supersampling=1), steps, progress)
-    return splats, f"Gaussians for a response of steepness {config.steepness:g}; {loss}"
+    return splats, f"Gaussians for a kernel of steepness {config.steepness:g}; {loss}"
 
 
 def _fitted(
@@ -182,7 +182,7 @@ def transform_splats(splats: Splats, new_from_old: Similarity) -> Splats:
     """Apply a similarity transform to Gaussians, including the directions of their colours."""
     from scipy.spatial.transform import Rotation
 
-    rotation = new_from_old.rotation.to(splats.means)
+    rotation = new_from_old.rotation.to(splats.sh_dc)
     quats = Rotation.from_matrix(new_from_old.rotation.cpu().numpy()) * Rotation.from_quat(
         splats.quats.cpu().double().roll(-1, 1).numpy()
     )

@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Callable
-from itertools import count, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from padgs.apps.camera_path_video import free_name
 from padgs.apps.viewer.renders import Box
 from padgs.files import write_atomically
 from padgs.scene import move_origin
@@ -116,11 +117,10 @@ class FilmControls:
             return
         poses = move_origin(torch.stack(self.keyframes), -self._origin.cpu())
         content = json.dumps({"keyframes": [{"cam_from_world": pose.tolist()} for pose in poses]}, indent=1).encode()
-        names = (self._folder / f"film{'' if number == 1 else f'-{number}'}.json" for number in count(1))
         reason = ""
         if self._may_write:
             try:
-                file = next(name for name in names if not name.exists())
+                file = free_name(self._folder / "film.json")
                 self._folder.mkdir(parents=True, exist_ok=True)
                 write_atomically(file, content)
                 self.words.content = f"saved. `padgs render {self._words} --path {shlex.quote(str(file))}`"
@@ -128,4 +128,4 @@ class FilmControls:
             except OSError as error:
                 reason = f"cannot write into {self._folder}: {error.strerror or error}; "
         self._client.send_file_download("film.json", content)
-        self.words.content = f"{reason}downloaded: `padgs render RUN --path film.json` makes the video"
+        self.words.content = f"{reason}downloaded: `padgs render {self._words} --path film.json` makes the video"

@@ -22,22 +22,24 @@ from padgs.geometry.similarity import Similarity
 
 MAX_FRAMES = 100_000  # longer videos fill the memory
 TRANSFORMS = "dataparser_transforms.json"
+Axis = tuple[float, float, float]
 
 
 def read_path(
-    file: Path, frames: int | None, up: tuple[float, float, float], transforms: Path | None = None, *, fps: float = 30.0
+    file: Path, frames: int | None, up: Axis, transforms: Path | None = None, *, fps: float = 30.0, to_data: bool = True
 ) -> Tensor:
     """Read the poses [F, 4, 4] of a file of keyframes, or a camera path of nerfstudio; a DataError names the place.
 
     Poses are resampled evenly to a number of `frames`; None: `fps` for each of the seconds that a camera path states,
     else its own poses, or one second between two keyframes. `up` is the default of keyframes with look_at.
-    `transforms` is the file from which the scene was read, if any.
+    `transforms` is the file from which the scene was read, if any. `to_data`: map a camera path of nerfstudio to the
+    world of the data set; Gaussians that nerfstudio exports are in its own.
     """
     if not file.exists():
         raise DataError(f"the path {file} does not exist; known: {', '.join(PATHS)}, or a JSON file")
     content = read_json(file)
     if cameras := content.get("camera_path"):
-        poses = _nerfstudio(cameras, file.parent / TRANSFORMS, transforms)
+        poses = _nerfstudio(cameras, file.parent / TRANSFORMS if to_data else None, transforms)
         if frames is None and (stated := content.get("seconds")):
             seconds = stated.numbers()
             if seconds.ndim or not 0 < seconds * fps <= MAX_FRAMES:
@@ -71,12 +73,12 @@ def _keyframe(entry: Json, up: Tensor) -> Tensor:
     return look_along(position[None].numpy(), (target - position)[None].numpy(), (up / up.norm()).numpy())[0]
 
 
-def _nerfstudio(cameras: Json, transforms: Path, transforms_json: Path | None) -> list[Tensor]:
+def _nerfstudio(cameras: Json, normalized: Path | None, transforms_json: Path | None) -> list[Tensor]:
     world = Similarity()
-    if transforms.is_file():
-        world = nerfstudio_world(transforms, transforms_json)
-    else:
-        where = f"there is no {transforms.name} beside the camera path"
+    if normalized is not None and normalized.is_file():
+        world = nerfstudio_world(normalized, transforms_json)
+    elif normalized is not None:
+        where = f"there is no {normalized.name} beside the camera path"
         warnings.warn(f"{where}: it is taken to be in the world of the data set; copy it from the run", stacklevel=2)
     poses = []
     if any(entry.get("fov") for entry in cameras.entries()):

@@ -41,7 +41,7 @@ def splat_run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def steep_run(tmp_path_factory):
-    """A run whose response is no Gaussian."""
+    """A run whose kernel is no Gaussian."""
     return tiny_run(tmp_path_factory, "method=padgs_plus", "data.generator.width=64", "train.iterations=60")
 
 
@@ -60,7 +60,7 @@ def test_an_exported_run_scores_like_the_run(splat_run):
     (splat_run / "splats.ply").unlink()
 
 
-def test_a_steeper_response_is_exported_as_gaussians_of_equal_area_and_fitted(steep_run, tmp_path):
+def test_a_steeper_kernel_is_exported_as_gaussians_of_equal_area_and_fitted(steep_run, tmp_path):
     run = padgs.load_run(steep_run, device="cpu")
     s, own = run.config.render.steepness, run.method.model.splats
     plain, fitted = (export_run(run, distillation_steps=steps) for steps in (0, 40))
@@ -72,7 +72,7 @@ def test_a_steeper_response_is_exported_as_gaussians_of_equal_area_and_fitted(st
     assert torch.equal(plain.splats.means, own.means) and not torch.equal(fitted.splats.means, own.means)
     apart = [float(re.search(r"dB, ([\d.]+) dB ", " ".join(found.notes))[1]) for found in (plain, fitted)]
     assert apart[1] < 0.5 * apart[0], "renders of the run are fitted, not photographs"
-    assert "Gaussians for a response of steepness 0.25; WS-PSNR of the test views" in " ".join(fitted.notes)
+    assert "Gaussians for a kernel of steepness 0.25; WS-PSNR of the test views" in " ".join(fitted.notes)
     assert "changes nothing" not in " ".join(plain.notes)
     gone = export(str(steep_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
     assert gone.exit_code == 0 and "Gaussians of equal area" in gone.output
@@ -180,14 +180,18 @@ def test_the_export_of_a_run_that_trains_says_of_which_iteration_it_is(splat_run
         assert result.exit_code == 0 and said.count("the run has not ended; its model is that of iteration 30") == count
 
 
-def test_harmonics_are_filled_up_on_request(splat_run, tmp_path):
-    """For programs that read degree 3 only."""
-    rests = []
-    for options in ((), ("--degree-3",)):
-        assert export(str(splat_run), "--to", str(tmp_path / "a.ply"), *options).exit_code == 0
-        names = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data.dtype.names
-        rests.append(sum(name.startswith("f_rest_") for name in names))
-    assert rests == [24, 45]
+def test_files_that_cannot_state_an_axis_are_upright(splat_run, tmp_path, monkeypatch):
+    means = {}
+    monkeypatch.setattr("padgs.apps.export.splat_file.check_suffix", lambda path: None)
+    monkeypatch.setattr(
+        "padgs.apps.export.splat_file.write_splats",
+        lambda path, splats, *_, **__: path.write_text("") or means.update({path.name: splats.means.detach()}),
+    )
+    names = ["a.compressed.ply", "a.spz", "a.SOG", "a.glb", "a.html", "a.ply"]
+    for name in names:
+        assert export(str(splat_run), "--to", str(tmp_path / name), "--device", "cpu").exit_code == 0
+    for name in names[:-1]:
+        assert torch.allclose(-means[name][:, 1], means["a.ply"][:, 2], atol=1e-4), "z is up in the built-in room"
 
 
 def test_the_file_says_which_axis_is_up_for_viewers_of_it_alone(splat_run, tmp_path):

@@ -33,7 +33,7 @@ def test_columns_of_3dgs(tmp_path, generator):
     write_splats(tmp_path / "a.ply", splats)
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     assert vertex["f_rest_1"][5] == splats.sh_rest[5, 1, 0].item(), "all of red comes first"
-    assert vertex["f_rest_8"][5] == splats.sh_rest[5, 0, 1].item()
+    assert vertex["f_rest_15"][5] == splats.sh_rest[5, 0, 1].item()
     assert vertex["rot_0"][5] == splats.quats[5, 0].item(), "w"
     splats.active_degree = 1
     write_splats(tmp_path / "a.ply", splats)
@@ -51,6 +51,13 @@ def test_colours_in_place_of_harmonics_are_read(tmp_path, generator):
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
     drawn = read_splats(tmp_path / "b.ply").gaussians(tiny_scene().train[0]).colors
     torch.testing.assert_close(drawn, torch.from_numpy(colors) / 255)
+    for kind, largest in ((np.float32, 1), (np.uint16, 65535)):
+        scaled = [(largest * (channel / 255)).astype(kind) for channel in colors.T]
+        other = rfn.drop_fields(table, ["red", "green", "blue"])
+        other = rfn.append_fields(other, ["red", "green", "blue"], scaled, usemask=False)
+        PlyData([PlyElement.describe(other, "vertex")]).write(str(tmp_path / "d.ply"))
+        drawn = read_splats(tmp_path / "d.ply").gaussians(tiny_scene().train[0]).colors
+        torch.testing.assert_close(drawn, torch.from_numpy(colors) / 255, atol=0.002, rtol=0)
     bare = rfn.drop_fields(table, ["opacity"])
     PlyData([PlyElement.describe(bare, "vertex")]).write(str(tmp_path / "c.ply"))
     with pytest.raises(DataError, match="has no property opacity"):
@@ -81,7 +88,7 @@ def test_rows_of_bytes_are_read(tmp_path):
 def test_harmonics_up_to_degree_3_are_filled_up_with_zeros(degree, active, tmp_path, generator):
     splats = random_splats(degree, generator)
     splats.active_degree = active
-    write_splats(tmp_path / "a.ply", splats, degree_3=True)
+    write_splats(tmp_path / "a.ply", splats)
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     names = [name for name in vertex.data.dtype.names if name.startswith("f_rest_")]
     rest = torch.stack([torch.from_numpy(vertex[name].copy()) for name in names], 1).view(-1, 3, 15)  # red first
@@ -89,10 +96,48 @@ def test_harmonics_up_to_degree_3_are_filled_up_with_zeros(degree, active, tmp_p
     assert names == [f"f_rest_{number}" for number in range(45)] and not rest[:, :, in_use:].any()
     assert torch.equal(rest[:, :, :in_use], splats.sh_rest[:, :in_use].mT)
     found, view = read_splats(tmp_path / "a.ply", unit=splats.scene_scale), tiny_scene().train[0]
-    assert found.active_degree == 3
+    assert found.degree == found.active_degree == active, "they are no part of the model"
     torch.testing.assert_close(found.gaussians(view).colors, splats.gaussians(view).colors)
-    write_splats(tmp_path / "b.ply", splats)
-    assert read_splats(tmp_path / "b.ply").active_degree == active
+
+
+def add_columns(file, to, *names):
+    """Copy a PLY with further properties of ones."""
+    table = PlyData.read(str(file))["vertex"].data
+    table = rfn.append_fields(table, names, [np.ones(len(table), np.float32)] * len(names), usemask=False)
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(to))
+
+
+def test_of_degree_4_the_lower_degrees_are_kept(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", splats := random_splats(3, generator))
+    add_columns(tmp_path / "a.ply", tmp_path / "b.ply", *(f"f_rest_{number}" for number in range(45, 72)))
+    table = PlyData.read(str(tmp_path / "b.ply"))["vertex"].data.copy()
+    for number, rest in enumerate(splats.sh_rest.detach().numpy().transpose(2, 1, 0).reshape(45, -1)):
+        channel, coefficient = divmod(number, 15)
+        table[f"f_rest_{24 * channel + coefficient}"] = rest
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "c.ply"))
+    with pytest.warns(UserWarning, match="c.ply has harmonics of degree 4; those up to degree 3 are used"):
+        found = read_splats(tmp_path / "c.ply")
+    assert found.degree == 3 and torch.equal(found.sh_rest, splats.sh_rest)
+
+
+def test_properties_that_nothing_reads_are_named(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", random_splats(0, generator))
+    add_columns(tmp_path / "a.ply", tmp_path / "b.ply", "label", "segment_id", "red", "filter_3D")
+    read_splats(tmp_path / "b.ply")
+    add_columns(tmp_path / "b.ply", tmp_path / "c.ply", "shape", "beta")
+    with pytest.warns(UserWarning, match="c.ply may look different here: nothing reads its properties beta, shape"):
+        read_splats(tmp_path / "c.ply")
+
+
+def test_doubles_hold_map_coordinates(tmp_path, generator):
+    write_splats(tmp_path / "a.ply", random_splats(0, generator))
+    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert read_splats(tmp_path / "a.ply").means.dtype == torch.float32
+    table = table.astype([(name, "f8" if name in "xyz" else "f4") for name in table.dtype.names])
+    table["y"] = 5_334_000.456
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "a.ply"))
+    found = read_splats(tmp_path / "a.ply")
+    assert found.means[0, 1].item() == 5_334_000.456 and found.log_scales.dtype == torch.float32
 
 
 def test_the_header_suits_the_viewer_of_3dgs(tmp_path, generator):
@@ -152,25 +197,21 @@ def test_invalid_files_are_refused(tmp_path, generator):
     with pytest.raises(DataError, match="has no property f_dc_0; Gaussians of 3DGS have x, y, z"):
         read_splats(tmp_path / "cloud.ply")
     write_splats(tmp_path / "a.ply", splats)
-    text = (tmp_path / "a.ply").read_bytes().replace(b"float opacity", b"float f_rest_0")
+    text = (tmp_path / "a.ply").read_bytes().replace(b"float opacity", b"float f_rest_45")
     (tmp_path / "a.ply").write_bytes(text)
     with pytest.raises(DataError, match="no property opacity"):
-        read_splats(tmp_path / "a.ply")
-    (tmp_path / "a.ply").write_bytes(text.replace(b"float nx", b"float packed_position"))
-    with pytest.raises(DataError, match=r"a compressed PLY; name it a\.compressed\.ply"):
         read_splats(tmp_path / "a.ply")
 
 
 def test_harmonics_are_numbered_from_0(tmp_path, generator):
     write_splats(tmp_path / "a.ply", random_splats(1, generator))
-    text = (tmp_path / "a.ply").read_bytes().replace(b"float f_rest_0\n", b"float f_rest_9\n")
+    text = (tmp_path / "a.ply").read_bytes().replace(b"float f_rest_0\n", b"float f_rest_45\n")
     (tmp_path / "a.ply").write_bytes(text)
     with pytest.raises(DataError, match="a.ply has no property f_rest_0; Gaussians of 3DGS"):
         read_splats(tmp_path / "a.ply")
 
 
-def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path, generator, monkeypatch):
-    monkeypatch.setattr(splat_file, "refuse_missing_converter", lambda *_: None)  # where the converter is missing
+def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path, generator):
     write_splats(tmp_path / "a.ply", random_splats(1, generator))
     (tmp_path / "a.compressed.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-9])
     with pytest.raises(DataError, match="a.compressed.ply is not a readable PLY file .*end-of-file"):
@@ -179,7 +220,7 @@ def test_a_truncated_compressed_file_is_refused_before_it_is_converted(tmp_path,
 
 def test_a_missing_converter_is_reported(tmp_path, generator, monkeypatch):
     monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
-    with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or take a .ply"):
+    with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or take an ordinary .ply"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
 
 
@@ -248,6 +289,32 @@ def converter(tmp_path, monkeypatch):
         (tmp_path / splat_file.CONVERTER).chmod(0o755)
 
     return install
+
+
+LAST_TWO = "while [ $# -gt 2 ]; do shift; done"  # source and target become the only arguments
+COPY = f'{LAST_TWO}; cp "$1" "$2"'
+
+
+def test_a_ply_is_compressed_by_its_content_not_by_its_name(tmp_path, generator, converter):
+    write_splats(tmp_path / "a.ply", splats := random_splats(1, generator))
+    shutil.copy(tmp_path / "a.ply", tmp_path / "plain.compressed.ply")
+    assert torch.equal(read_splats(tmp_path / "plain.compressed.ply").means, splats.means), "without the converter"
+    packed = np.zeros(4, [("packed_position", "<u4")])
+    PlyData([PlyElement.describe(packed, "vertex")]).write(str(tmp_path / "b.ply"))
+    with pytest.raises(ValueError, match=r"reading b.ply needs splat-transform, .* or take an ordinary .ply"):
+        read_splats(tmp_path / "b.ply")
+    converter(f'{LAST_TWO}; cp {tmp_path}/a.ply "$2"')
+    assert torch.equal(read_splats(tmp_path / "b.ply").means, splats.means)
+
+
+def test_spz_is_of_version_3_and_glb_is_not_read_back(tmp_path, generator, converter):
+    """Many viewers read no version 4; only the option makes this one write."""
+    converter(f'case "$*" in *.spz) echo "$*" | grep -q -e "--spz-version 3 " || exit 1;; esac; {COPY}')
+    write_splats(tmp_path / "a.spz", splats := random_splats(2, generator))
+    assert len(PlyData.read(str(tmp_path / "a.spz"))["vertex"].data.dtype.names) == 17 + 24, "of the model's degree"
+    converter(f'{LAST_TWO}; case "$1" in *.glb) exit 1;; esac; {COPY}')
+    write_splats(tmp_path / "a.glb", splats)
+    assert (tmp_path / "a.glb").stat().st_size
 
 
 def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, converter):

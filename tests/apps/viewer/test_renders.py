@@ -131,4 +131,5 @@ def test_a_film_that_cannot_be_saved_is_downloaded(tmp_path):
     film.save()
     (name, content), _ = client.send_file_download.call_args
     assert name == "film.json" and len(json.loads(content)["keyframes"]) == 2
-    assert film.words.content.startswith("cannot write into") and "downloaded" in film.words.content
+    assert film.words.content.startswith("cannot write into")
+    assert "downloaded: `padgs render a.ply --path film.json`" in film.words.content

@@ -51,7 +51,7 @@ def test_no_run_is_opened_before_all_have_a_checkpoint(tmp_path, monkeypatch):
     """Wait for all runs first: one opened before would be old by then."""
     done = []
     scene = SimpleNamespace(name="room")
-    opened = lambda path, *_: done.append(("open", path)) or SimpleNamespace(notes=(), scene=scene)  # noqa: E731
+    opened = lambda path, *_, **__: done.append(("open", path)) or SimpleNamespace(notes=(), scene=scene)  # noqa: E731
     monkeypatch.setattr(process, "wait_for_checkpoint", lambda folder: done.append(("wait", folder)))
     monkeypatch.setattr("padgs.apps.external.open_model", opened)
     monkeypatch.setattr(process, "serve", lambda load_runs, **_: load_runs())
@@ -61,6 +61,20 @@ def test_no_run_is_opened_before_all_have_a_checkpoint(tmp_path, monkeypatch):
         (Path(folder) / "config.yaml").touch()
     assert CliRunner().invoke(app, ["view", folders[0], "--beside", folders[1]]).exit_code == 0
     assert done == [(step, folder) for step in ("wait", "open") for folder in folders]
+
+
+def test_files_are_opened_before_the_page_is_served_and_once(tmp_path, monkeypatch):
+    """An error needs no page, and stands alone."""
+    (tmp_path / "a.ply").write_bytes(b"ply\n")
+    shown = MagicMock()
+    monkeypatch.setattr(process, "serve", shown)
+    done = CliRunner().invoke(app, ["view", str(tmp_path / "a.ply")])
+    assert done.exit_code == 1 and "a.ply is not a readable PLY file" in done.output and not shown.called
+    found = MagicMock(return_value=SimpleNamespace(notes=(), scene=SimpleNamespace(name="room")))
+    monkeypatch.setattr("padgs.apps.external.open_model", found)
+    assert CliRunner().invoke(app, ["view", str(tmp_path / "a.ply"), "--device", "cpu"]).exit_code == 0
+    assert shown.call_args.args[0]() == [found.return_value]
+    assert found.call_count == 1 and found.call_args.kwargs == {"device": "cpu"}
 
 
 def test_the_page_is_served_before_torch_is_loaded():
