@@ -15,13 +15,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING
-from unicodedata import normalize
+from unicodedata import category, normalize
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 # Other decoders of Pillow run programs on what a file holds, such as Ghostscript, whatever the name of the file.
 IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 # First bytes of formats that Pillow does not know.
 _OTHER_FORMATS = {b"ftyp": "HEIC, AVIF or video", b"%PDF": "PDF", b"\0\0\0\x0cJXL": "JPEG XL", b"<": "HTML, XML or SVG"}
 # Errors of Pillow
@@ -36,12 +37,13 @@ DAY = 86400.0  # seconds
 def file_name(text: str) -> str:
     """Return a text as a file name without separators and of at most `LONGEST` bytes, so that an ending still fits.
 
-    Letters of all languages stay, since names may differ in them; longer names end with a digest.
+    Letters and vowel signs of all languages stay, since names may differ in them; longer names end with a digest.
 
-    >>> file_name("left/R001 a"), file_name("chart_../../etc"), file_name("客厅 1")
-    ('left-R001-a', 'chart_..-..-etc', '客厅-1')
+    >>> file_name("left/R001 a"), file_name("chart_../../etc"), file_name("客厅 1"), file_name("कमरा")
+    ('left-R001-a', 'chart_..-..-etc', '客厅-1', 'कमरा')
     """
-    name = re.sub(r"[^\w.-]+", "-", text)
+    kept = (sign if sign.isalnum() or sign in "._-" or category(sign)[0] == "M" else " " for sign in text)
+    name = re.sub(" +", "-", "".join(kept))
     if len(long := name.encode()) > LONGEST:  # which file systems do not accept with an ending
         digest = hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:9]
         name = f"{long[: LONGEST - 10].decode(errors='ignore')}-{digest}"

@@ -3,6 +3,7 @@
 `load(path)` detects the format; `Scene.notes` says what was decided and why.
 """
 
+import json
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import entry_points
@@ -10,12 +11,12 @@ from pathlib import Path
 
 from padgs.checks import lookup
 from padgs.data.assemble import PREPARED, assemble, found_images
-from padgs.data.capture import OTHERS, Capture, DataError, DataOptions, first_of
+from padgs.data.capture import OTHERS, Capture, DataError, DataOptions
 from padgs.data.cloud import NO_FILE, read_cloud
 from padgs.data.conventions import best_reading
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.formats import detect
-from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS
+from padgs.data.masks import mask_digests
 from padgs.files import given_path
 from padgs.scene import Scene
 
@@ -92,9 +93,8 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
     if not isinstance(capture, Capture):
         raise ValueError(f"{LOADERS[format]} returned {type(capture).__name__}; a reader returns a Capture")
     mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
-    if mask == "auto" and (path / PREPARED).is_file():
-        ours = first_of(path, SCENE_MASKS[:1]) or first_of(path, MASK_FOLDERS[:1], Path.is_dir)
-        mask = ours.name if ours else mask  # not inverted, though it may hide most of the sphere, as of narrow crops
+    if mask == "auto":
+        mask = next(filter(None, map(_prepared_mask, capture.places)), mask)
     capture = replace(capture, mask=mask, notes=(*notes, *capture.notes))
     if options.points != "auto" and any(not one.axes.equal(capture.readings[0].axes) for one in capture.readings):
         with suppress(DataError):  # if its own points cannot be read, nothing says how its images are turned
@@ -104,3 +104,10 @@ def read(path: str | Path, format: str = "auto", options: DataOptions = DataOpti
         cloud, notes = read_cloud(given_path(options.points, capture.folder))
         capture = replace(capture, cloud=cloud, tracks=None, notes=(*capture.notes, *notes))
     return best_reading(found_images(capture))
+
+
+def _prepared_mask(folder: Path) -> str | None:
+    """Return the mask file or folder that `padgs prepare` wrote, if unchanged: it may hide most, as of narrow crops."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        written = json.loads((folder / PREPARED).read_text(encoding="utf-8"))["masks"]
+        return next(iter(written)).partition("/")[0] if written and written == mask_digests(folder) else None

@@ -22,13 +22,12 @@ from padgs.data.masks import find_masks, is_of_masks, masks_beside
 from padgs.data.metres import unit_note
 from padgs.data.splits import is_inside, spellings, split_frames
 from padgs.data.store import ImageStore, StoredImage, cache_root
-from padgs.files import file_name, folded, given_path
+from padgs.files import IMAGE_FOLDERS, file_name, folded, given_path
 from padgs.geometry.camera import sphere_share
 from padgs.scene import Scene, View
 
 MAX_GAP = 100  # between cameras and points, times the median distances within both
 MIN_SIDE = 3  # pixels of a photograph, whose solid angles are differences of rays
-IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
 HIDDEN = (".", "__MACOSX", "@eaDir", "@Recycle", "#recycle")  # beginnings of names; network drives keep previews there
 PREPARED = "prepare.json"  # written by `padgs.data.prepare`
 # Files that identify a prepared data set, and a run (see `padgs.results`). Searches for images skip such folders: they
@@ -86,7 +85,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         notes.append(f"{len(unposed)} images have no pose and are not used: {listed(unposed)}")
     rules = {"mode": options.split, "every": options.test_every, "stated": capture.split}
     photographs = [frame.name for frame in frames[panoramas:]] if left_out else []
-    split = split_frames(names, capture.folder, unposed=unposed, left_out=photographs, **rules)
+    split = split_frames(names, *capture.places, unposed=unposed, left_out=photographs, **rules)
     if min(split.train) >= panoramas:
         raise DataError("the train split holds no panorama, only photographs; name a panorama, or set data.split=every")
     points, colors, cloud_notes = initial_cloud(capture, options.points)
@@ -101,7 +100,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         view = View(view_name(frame.name), frame.cam_from_world, *size, pixels, mask, lens, share=frame.share)
         views.append(view if lens is None else replace(view, sphere_share=sphere_share(lens)))
     views, depth_digests, depth_notes = with_depths(views, capture, options)
-    name = capture.name or Path(os.path.abspath(capture.folder)).name  # works for "." too; a link keeps its name
+    folder, around = (Path(os.path.abspath(capture.places[i])) for i in (0, -1))  # also of "."; a link keeps its name
+    name = capture.name or (around if folder.is_relative_to(around) else folder).name  # that of a file in export/
     train, test = (tuple(views[i] for i in part) for part in (split.train, split.test))
     all_notes = (*notes, *split.notes, *mask_notes, *depth_notes, *cloud_notes, *cache_notes)
     scene = Scene(name, train, test, points, colors, fingerprint="", notes=all_notes).recentered()
@@ -268,7 +268,7 @@ def _without_unlisted(capture: Capture, options: DataOptions) -> Capture:
     names, there = [frame.name for frame in capture.frames], [frame.image.is_file() for frame in capture.frames]
     if all(there) or options.split in ("every", "all"):
         return capture
-    split = split_frames(names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split)
+    split = split_frames(names, *capture.places, mode=options.split, every=options.test_every, stated=capture.split)
     kept = [there[i] or i in split.train or i in split.test for i in range(len(names))]
     if not (lost := [name for name, is_kept in zip(names, kept, strict=True) if not is_kept]):
         return capture

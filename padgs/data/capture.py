@@ -6,6 +6,7 @@ Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from padgs.checks import unknown
+from padgs.files import IMAGE_FOLDERS
 from padgs.geometry.camera import Camera
 
 Progress = Callable[[int, int], None]  # called with (done, total)
@@ -164,7 +166,7 @@ class Capture:
     """Contents of a data set before its images are read."""
 
     format: str
-    folder: Path  # of the data set; may also hold masks and split lists
+    folder: Path  # of the data set, or of the file that describes it
     image_folder: Path
     frames: tuple[Frame, ...]
     cloud: Cloud | None
@@ -176,6 +178,14 @@ class Capture:
     depth: DepthMeaning | None = None  # of the frames' depth maps
     name: str | None = None  # of the scene, if it is not that of the folder
     readings: tuple[Reading, ...] = ()  # the first is the usual one; see `padgs.data.conventions.best_reading`
+
+    @property
+    def places(self) -> tuple[Path, ...]:
+        """Return the folders of masks, depth maps and lists: that of the data set, and that around its images."""
+        images = Path(os.path.abspath(self.image_folder))  # of "." too
+        if self.folder != self.image_folder:
+            return tuple(dict.fromkeys((self.folder, self.image_folder.parent)))
+        return (images.parent, self.folder) if images.name.lower() in IMAGE_FOLDERS else (self.folder,)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from padgs.data import conventions
 from padgs.data.assemble import assemble
 from padgs.data.camera_paths import Gravity, centers, gravity, path_length
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Progress, listed, natural_key, view_name
-from padgs.data.cloud import GREY_POINTS
+from padgs.data.cloud import GREY
 from padgs.data.images import decode, inspect, refuse_dual_fisheye
 from padgs.data.masks import MAX_HIDDEN
 from padgs.geometry.panorama import project
@@ -80,13 +80,15 @@ def check(
     used = [frame for frame in capture.frames if frame.lens is None or options.cameras != "panoramas"]
     digests = _check_images(used, report, progress)
     damaged = bool(report.problems)
-    if (scene := _assemble(capture, options, report)) is None:
+    scene, points = _assemble(capture, options, report)
+    if scene is None:
         return report
+    measured = None if points == "random" else capture.cloud  # else training starts from random points
     views = (*scene.train, *scene.test)
     poses = torch.stack([view.cam_from_world for view in views])
     report.train, report.test = len(scene.train), len(scene.test)
     report.unused = len(used) - report.train - report.test
-    report.points, report.coloured = len(scene.points), not any(GREY_POINTS in note for note in scene.notes)
+    report.points, report.coloured = len(scene.points), bool((scene.point_colors != GREY).any())
     sizes = sorted({(view.width, view.height) for view in views})
     report.resolution = listed(f"{width}x{height}" for width, height in sizes)
     report.notes += scene.notes
@@ -95,8 +97,9 @@ def check(
     report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
     report.median_depth = scene.scale
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
-    if hidden := [f"{view.name} ({share:.1%})" for view in views if (share := _hidden(view)) > MAX_HIDDEN]:
-        text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the image: {listed(hidden)}; "
+    shares = [(view.name, getattr(view.load_mask, "hidden", 0.0)) for view in views]
+    if hidden := [f"{name} ({share:.1%})" for name, share in shares if share > MAX_HIDDEN]:
+        text = f"the masks of {len(hidden)} views hide more than {MAX_HIDDEN:.0%} of the sphere: {listed(hidden)}; "
         text += "255 means use, 0 means ignore: repair them, or set data.mask to none, inverted or a folder"
         (report.problems if options.mask == capture.mask == "auto" else report.notes).append(text)
     _check_leaks(scene, digests, report)
@@ -105,8 +108,8 @@ def check(
     if damaged:  # the fit needs readable pixels
         return report
     scene = replace(scene, train=scene.panoramas, test=tuple(view for view in scene.test if view.lens is None))
-    _check_fit(capture, scene, report)
-    if capture.cloud is not None and not any("random points" in note for note in scene.notes):
+    _check_fit(capture, scene, report, is_measured=measured is not None)
+    if measured is not None:
         _check_depth(scene, report)
     if overlay is not None:
         try:
@@ -115,14 +118,6 @@ def check(
         except DataError as error:
             report.problems.append(str(error))
     return report
-
-
-def _hidden(view: View) -> float:
-    """Return the share that a mask file hides of what the picture, maybe a part of a panorama, shows."""
-    if (mask := view.mask()) is None:
-        return 0.0
-    pictured = getattr(view.load_mask, "fixed", None)
-    return 1 - mask.mean().item() / (1.0 if pictured is None else pictured.mean().item())
 
 
 def _check_depth(scene: Scene, report: Report) -> None:
@@ -161,16 +156,17 @@ def _check_images(frames: Sequence[Frame], report: Report, progress: Progress) -
     return digests
 
 
-def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
-    """Build the scene; if that fails, retry without mask, split, points or depth, to report all problems."""
+def _assemble(capture: Capture, options: DataOptions, report: Report) -> tuple[Scene | None, str]:
+    """Build the scene, if need be without mask, split, points or depth, to report all problems; return `points` too."""
     mask, split, points, depth = {"mask": "none"}, {"split": "all"}, {"points": "random"}, {"depth": "none"}
     for change in ({}, mask, split, points, depth, mask | split, mask | split | points | depth):
         try:
-            return assemble(capture, replace(options, **change))
+            tried = replace(options, **change)
+            return assemble(capture, tried), tried.points
         except DataError as error:
             if str(error) not in report.problems:
                 report.problems.append(str(error))
-    return None
+    return None, options.points
 
 
 def _check_leaks(scene: Scene, digests: dict[str, str], report: Report) -> None:
@@ -191,7 +187,7 @@ def _check_leaks(scene: Scene, digests: dict[str, str], report: Report) -> None:
         )
 
 
-def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
+def _check_fit(capture: Capture, scene: Scene, report: Report, *, is_measured: bool) -> None:
     """Compare points with observations, else with colours, under the stated and other pose conventions."""
     known = conventions.known_conventions()
     tracks = None if capture.tracks is None or capture.cloud is None else capture.tracks()
@@ -224,7 +220,7 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     compared = report.coloured and report.points >= MIN_POINTS and scene.point_colors.float().std(0).max() >= 1
     if not (compared or report.observations):
         report.notes.append("poses are not compared with images: there are neither observations nor coloured points")
-    if any("random points" in note for note in scene.notes):
+    if not is_measured:
         return
     if report.suggestion is None:
         _check_exposures(scene, rows, report)

@@ -27,7 +27,7 @@ MOST_POINTS = 1_000_000  # more are thinned out evenly, because training starts 
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
 VISIBLE_STEP = 0.002  # of the median distance of points from their middle
-GREY, GREY_POINTS = 128, "points: the cloud has no colours; grey is used"
+GREY = 128  # of points without colours
 
 
 def read_ply(path: Path) -> Cloud:
@@ -183,7 +183,7 @@ def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[
         notes = (*notes, f"points: one in {step} of {where}, {len(points)} in all")
     if colors is None or not colors.any():  # black is what scanners without a camera write
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
-        notes = (*notes, GREY_POINTS)
+        notes = (*notes, "points: the cloud has no colours; grey is used")
     return points.double(), colors, notes
 
 

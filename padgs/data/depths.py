@@ -151,8 +151,8 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
             lost = f"{len(absent)} depth maps of {capture.format} do not exist ({listed(absent)})"
             raise DataError(f"{lost}; copy them, or set data.depth=none")
         return named, capture.depth if named else None, []
-    places, notes = (capture.folder, capture.image_folder.parent), []
-    usual = (first_of(base, (name,), Path.is_dir) for base in places for name in FOLDERS)
+    notes: list[str] = []
+    usual = (first_of(base, (name,), Path.is_dir) for base in capture.places for name in FOLDERS)
     for folder in dict.fromkeys(folder for folder in usual if folder):
         inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
         maps = [path for end in reversed(EXTENSIONS) for path in inside if path.suffix.lower() == end]  # the best last
@@ -164,9 +164,11 @@ def _depth_files(capture: Capture) -> tuple[dict[str, Path], DepthMeaning | None
             keys = (folded(image.with_name(name)) for name in names)
             if found := next((there[key] for key in keys if key in there), None):
                 files[frame.name] = found
-        if files:
+        if files and (folder / STATEMENT).is_file():
             return files, _stated(folder / STATEMENT, any(map(_may_be_whole, files.values()))), notes
-        if there:
+        if files:  # maybe previews, or of another program
+            notes.append(f"depth: {folder} is not used: no {STATEMENT} says what its maps hold; to use them, {HOW}")
+        elif there:
             examples = f"{next(iter(there.values())).name} for {capture.frames[0].name}"
             notes.append(f"depth: none of the {len(there)} maps in {folder} is named like an image, such as {examples}")
         elif inside:
@@ -185,8 +187,6 @@ def _may_be_whole(file: Path) -> bool:
 
 def _stated(file: Path, may_be_whole: bool) -> DepthMeaning:
     """Read what the maps of a folder hold; the steps of integers have no usual unit."""
-    if not file.is_file():
-        raise DataError(f"{file.parent} holds depth maps, but there is no {file.name} that says what they hold; {HOW}")
     try:
         stated = json.loads(read_bytes(file))
         measure = stated["measure"]

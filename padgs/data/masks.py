@@ -4,10 +4,12 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 `data.mask=inverted` (or inverted:FOLDER) reads files in which 255 marks what to ignore.
 """
 
+import hashlib
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from statistics import median
 
@@ -16,7 +18,7 @@ from torch import Tensor
 
 from padgs.data.capture import Capture, DataError, first_of, listed
 from padgs.data.image_metadata import Crop
-from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
+from padgs.data.images import EXTENSIONS, ImageFile, inspect, read_bytes, save_png
 from padgs.data.store import ImageStore, StoredImage
 from padgs.files import folded, given_path
 from padgs.geometry.distortion import solid_angle_weight
@@ -37,6 +39,7 @@ class Mask:
     file: StoredImage | None
     fixed: Tensor | None  # [H, W or 1] float32, of `rows:` and of crops
     inverted: bool = False  # whether 255 means ignore in the file
+    hidden: float = 0.0  # share that the file hides of what the picture, maybe a part of a panorama, shows
 
     def __call__(self) -> Tensor:
         """Return weights [H, W] float32 in [0, 1]."""
@@ -81,11 +84,11 @@ def find_masks(
     inverted, given = spec == "inverted" or spec.startswith("inverted:"), spec
     spec = (spec.removeprefix("inverted").removeprefix(":") or "auto") if inverted else spec
     rule = _ROWS.fullmatch(spec)
-    stated = capture.folder / spec if given == capture.mask else None  # by the data set, so in its folder
-    path = stated if stated is not None and stated.exists() else mask_path(spec, capture.folder)
+    stated = (place / spec for place in capture.places if given == capture.mask)  # by the data set, so in its folders
+    path = next(filter(Path.exists, stated), None) or mask_path(spec, *capture.places)
     files, note = ({}, None) if spec == "none" else _mask_files(capture, path)
     if inverted and not files:
-        raise DataError(f"data.mask={given}: there are no mask files to invert; put some in {capture.folder / 'masks'}")
+        raise DataError(f"data.mask={given}: there are no mask files to invert; put them in {capture.places[-1]}/masks")
     notes = [note] if note else []
     rows: dict[int, Tensor] = {}  # by height
     if rule:
@@ -121,25 +124,27 @@ def find_masks(
         if mask.file not in shown:
             rule = f" of {frame.name}; {_MEANING}"
             shown[mask.file] = _refuse_hidden(mask(), f"{path} hides ", rule) / pictured
-        masks.append(mask)
+        masks.append(replace(mask, hidden=1 - shown[mask.file]))
         digests.append(f"{frame.name}:{mask_file.digest}{':inverted' * mask.inverted}")
     if shown and (hidden := 1 - median(shown.values())) > MAX_HIDDEN:
         hides = f"the masks hide {hidden:.0%} of the sphere"
         if given == "auto":
-            where = os.path.relpath(next(iter(inspected))[0], capture.folder).split(os.sep)[0]
-            names = listed(path.name for path, _ in inspected)
+            paths = [path for path, _ in inspected]
+            where = min((os.path.relpath(paths[0], place) for place in capture.places), key=len).split(os.sep)[0]
+            names = listed(path.name for path in paths)
             raise DataError(f"{hides}, in {names}; {_MEANING}; if that is meant, set data.mask={where}")
         notes.append(f"{hides}, as data.mask={given} says")
     return masks, digests, notes
 
 
-def mask_path(spec: str, folder: Path) -> Path | None:
+def mask_path(spec: str, *folders: Path) -> Path | None:
     """Return the file or folder that `data.mask` names; None for a keyword.
 
-    Relative paths are looked up in the data set's folder and in the working directory; two that differ are a DataError.
+    Relative paths are looked up in the folders of the data set and in the working one; two that differ are a DataError.
     """
     if spec in ("auto", "none", "inverted") or _ROWS.fullmatch(spec):
         return None
+    folder = next((folder for folder in folders if (folder / spec).exists()), folders[0])
     inside, here = folder / spec, Path(spec).absolute()
     if here.exists() and inside.exists() and not inside.samefile(here):
         raise DataError(f"data.mask={spec} is both {inside} and {here}; give the absolute path of one")
@@ -170,13 +175,14 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
             raise DataError(f"the mask {absent[0]} that {capture.format} names does not exist; set data.mask=none")
         return named, f"masks: those that {capture.format} names, for {len(named)} of {len(capture.frames)} views"
     if given is None:
-        folder = capture.folder
-        folders = [first_of(parent, MASK_FOLDERS, Path.is_dir) for parent in (folder, capture.image_folder)]
-        given = first_of(folder, SCENE_MASKS) or folders[0] or folders[1] or capture.image_folder
+        kinds = ((SCENE_MASKS, Path.is_file), (MASK_FOLDERS, _holds_any))
+        places = (first_of(place, names, kind) for place in capture.places for names, kind in kinds)
+        inner = first_of(capture.image_folder, MASK_FOLDERS, _holds_any)
+        given = next(filter(None, (*places, inner)), capture.image_folder)
     if given.is_file():
         panoramas = [frame.name for frame in capture.frames if frame.lens is None]
         which = "every view" if len(panoramas) == len(capture.frames) else "every panorama"
-        beside = first_of(given.parent, MASK_FOLDERS, Path.is_dir) if given.parent == capture.folder else None
+        beside = first_of(given.parent, MASK_FOLDERS, _holds_any) if given.parent in capture.places else None
         unused = f"; {beside.name}/ is not used (data.mask={beside.name} uses it)" if beside else ""
         return dict.fromkeys(panoramas, given), f"mask: {given.name} for {which}{unused}"
     beside, files = given == capture.image_folder, dict[str, Path]()
@@ -186,9 +192,11 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
         if len(inside.parts) >= deepest:  # in masks/ beside the deepest image; links may go round in circles
             folders.clear()
         files |= {folded(inside / name): Path(folder, name) for name in names}
-    found = {frame.name: path for frame in capture.frames if (path := _in_folder(files, frame.name, beside))}
+    ends = Counter(folded(PurePosixPath(frame.name).stem) for frame in capture.frames)
+    found = {frame.name: path for frame in capture.frames if (path := _in_folder(files, frame.name, beside, ends))}
     if beside and not found:
-        others = [path.name for path in sorted(capture.folder.glob("*")) if re.search("mask|segm", path.name, re.I)]
+        around = [path for place in capture.places for path in sorted(place.glob("*"))]
+        others = [path.name for path in around if re.search("mask|segm", path.name, re.I)]
         return {}, f"masks: not used: {listed(others)}; name one with data.mask" if others else None
     if not found:
         such = f"named like an image (such as {capture.frames[0].name}.png)"
@@ -196,11 +204,15 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
     turned = " (white is ignored)" if any(path.name.startswith(INVERTED) for path in found.values()) else ""
     others = sorted({*given.glob("*")} - {*found.values()}) if len(found) < len(capture.frames) else []
     left = [path.name for path in others if path.suffix.lower() in EXTENSIONS]
-    if given.parent == capture.folder:
-        there = (first_of(capture.folder, (name,), Path.is_dir) for name in MASK_FOLDERS)
+    if given.parent in capture.places:
+        there = (first_of(given.parent, (name,), _holds_any) for name in MASK_FOLDERS)
         left += [f"{folder.name}/" for folder in there if folder not in (given, None)]
     rest = f"; not used: {listed(left)}" if left and not beside else ""
     return found, f"masks: {given.name}/ for {len(found)} of {len(capture.frames)} views{turned}{rest}"
+
+
+def _holds_any(folder: Path) -> bool:
+    return folder.is_dir() and not all(path.name.startswith(".") for path in folder.iterdir())
 
 
 def masks_beside(name: str) -> list[str]:
@@ -227,14 +239,22 @@ def is_of_masks(name: str) -> bool:
     return any(re.search(r"(?i)(?<![a-z])masks?(?![a-z])", part) for part in PurePosixPath(name).parts[:-1])
 
 
-def _in_folder(files: Mapping[str, Path], name: str, beside: bool) -> Path | None:
-    """Return the mask of an image among the files of a folder by folded path: in any case and Unicode form."""
+def _in_folder(files: Mapping[str, Path], name: str, beside: bool, ends: Mapping[str, int]) -> Path | None:
+    """Return the mask of an image among files by folded path, or by its last name if that is unique (counts `ends`)."""
     stem = PurePosixPath(name).with_suffix("")
     first, *others = masks_beside(name)
     for candidate in [first, *([] if beside else [f"{stem}{end}" for end in (".png", *EXTENSIONS)]), *others]:
         if (file := files.get(folded(candidate))) and file.is_file():
             return file
-    return None
+    is_alone = not beside and "/" in name and ends[folded(stem.name)] == 1
+    return _in_folder(files, PurePosixPath(name).name, beside, ends) if is_alone else None
+
+
+def mask_digests(folder: Path) -> dict[str, str]:
+    """Return the digests of mask.png, else of the masks in masks/, by their paths in a folder."""
+    scene, inside = folder / SCENE_MASKS[0], sorted((folder / MASK_FOLDERS[0]).rglob("*"))
+    files = [scene] if scene.is_file() else [path for path in inside if path.suffix.lower() in EXTENSIONS]
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(read_bytes(path)).hexdigest() for path in files}
 
 
 def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:

@@ -26,8 +26,7 @@ class Split:
 
 def split_frames(
     names: Names,
-    folder: Path,
-    *,
+    *folders: Path,
     mode: str = "auto",
     every: int = EVERY,
     stated: Mapping[str, tuple[str, ...]] | None = None,
@@ -36,16 +35,16 @@ def split_frames(
 ) -> Split:
     """Decide for each frame whether it is a training view, a test view, or unused.
 
-    `names` are those of frames, with extension and sorted; `folder` holds `train.txt` and `test.txt`, if any: one name
-    a line, with or without extension. `mode` is files; every (views 0, k, 2k, ... are test views, k is `every`); all
-    (no test views); or auto: the lists that the format has `stated`, else files if there is a list, else every. Lists
-    may hold names that are `left_out`. A DataError says that a list holds unknown, ambiguous or `unposed` names, that
-    lists overlap, or that a side is empty.
+    `names` are those of frames, with extension and sorted; the first of `folders` that has `train.txt` or `test.txt`
+    counts: one name a line, with or without extension. `mode` is files; every (views 0, k, 2k, ... are test views, k is
+    `every`); all (no test views); or auto: the lists that the format has `stated`, else files if there is a list, else
+    every. Lists may hold names that are `left_out`. A DataError says that a list holds unknown, ambiguous or `unposed`
+    names, that lists overlap, or that a side is empty.
     """
     if mode == "all":
         _refuse_every(every, "data.split=all")
         return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
-    places = (folder, folder / "sparse" / "0")  # the second as in the released 3DGS
+    places = [place for folder in folders for place in (folder, folder / "sparse" / "0")]  # as in the released 3DGS
     found = {side: [file for place in places if (file := first_of(place, (name,)))] for side, name in LISTS.items()}
     files = {side: some[0] for side, some in found.items() if some}
     lists = dict(stated or {}) if mode == "auto" else {}
@@ -59,7 +58,7 @@ def split_frames(
         origin = " and ".join(file.name for file in files.values())
     if not lists:
         if mode == "files":
-            raise DataError(f"data.split=files, but {folder} holds no train.txt, no test.txt; write them or use every")
+            raise DataError(f"data.split=files: {folders[0]} holds no train.txt, no test.txt; write one, or use every")
         return _every(names, every, mode)
     _refuse_every(every, origin.partition(";")[0])
     chosen = {side: _resolve(lines, names, which[side], unposed, left_out) for side, lines in lists.items()}

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load, read
 from padgs.data.assemble import _camera_notes, disk_cache
-from padgs.data.capture import Cloud, Frame
+from padgs.data.capture import Capture, Cloud, Frame
 from padgs.data.cloud import write_ply
 from padgs.data.formats import poses
 from padgs.data.images import ImageFile
@@ -121,6 +121,16 @@ def test_names_that_differ_in_case_only_and_second_poses_are_refused(folder: Pat
         load(folder)
 
 
+@pytest.mark.parametrize("pair", [("कमरा", "कमरी"), ("ที่", "ที"), ("שָ", "שִ")], ids=["Devanagari", "Thai", "Hebrew"])
+def test_names_that_differ_in_vowel_signs_do_not_clash(pair: tuple[str, str], folder: Path) -> None:
+    listing = folder / "sparse/0/images.txt"
+    for old, new in zip(("pano_02", "pano_03"), pair, strict=True):
+        (folder / "images" / f"{old}.png").rename(folder / "images" / f"{new}.png")
+        for file in (listing, folder / "train.txt"):
+            file.write_text(file.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    assert {*pair} <= {view.name for view in load(folder).train}
+
+
 def test_random_points_and_missing_files(folder: Path) -> None:
     scene = load(folder, points="random")
     spread = torch.stack([view.center for view in (*scene.train, *scene.test)])
@@ -149,6 +159,20 @@ def test_the_working_directory_has_a_name(folder: Path, monkeypatch: pytest.Monk
     assert load(".").name == load(folder).name == "scene"
 
 
+@pytest.mark.parametrize(
+    ("folder", "images", "places"),
+    [
+        ("flat", "flat/images/left", ("flat", "flat/images")),
+        ("flat/export", "flat/images", ("flat/export", "flat")),
+        ("flat", "flat", ("flat",)),
+        ("flat/RGB", "flat/RGB", ("flat", "flat/RGB")),
+    ],
+)
+def test_masks_depth_maps_and_lists_have_their_places(folder: str, images: str, places: tuple[str, ...]) -> None:
+    found = Capture("made", Path("/scans", folder), Path("/scans", images), (), None).places
+    assert found == tuple(Path("/scans", place) for place in places)
+
+
 def test_missing_scenes_and_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"absent does not exist; give the folder of"):
         load(tmp_path / "absent")
@@ -161,6 +185,14 @@ def test_missing_scenes_and_unknown_formats_are_refused(tmp_path: Path) -> None:
         hint = "a has: give that;" if name == "a" else "a, .*b have: give one;"
         with pytest.raises(DataError, match=f"no known format, but .*{hint} it holds"):
             load(tmp_path)
+    (tmp_path / "transforms.json").write_text("{}")
+    for i in range(60):
+        (tmp_path / "a" / f"{i:02}.jpg").touch()
+    (tmp_path / "a" / "transforms.json").rename(tmp_path / "a" / "more.json")
+    (tmp_path / "a" / "scene").mkdir()
+    (tmp_path / "a" / "scene" / "transforms.json").write_text("{}")
+    with pytest.raises(DataError, match=f"{tmp_path}/a has no known format, but {tmp_path}/a/scene, {tmp_path} have:"):
+        load(tmp_path / "a")
     with pytest.raises(ValueError, match="unknown data.format 'colmpa'; known: colmap"):
         load(tmp_path, "colmpa")
 

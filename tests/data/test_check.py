@@ -130,7 +130,9 @@ def test_all_problems_are_reported_at_once(world: World, tmp_path: Path) -> None
     assert "overlap" in problems and "hides every pixel" in problems
     (tmp_path / "depths").mkdir()
     np.save(tmp_path / "depths/pano_00.npy", np.ones((4, 8)))
-    assert "there is no depth.json" in (problems := "\n".join(check(tmp_path).problems)) and "overlap" in problems
+    (tmp_path / "depths/depth.json").write_text("[]")
+    problems = "\n".join(check(tmp_path).problems)
+    assert "depth.json does not say what the depth maps hold" in problems and "overlap" in problems
 
 
 @pytest.mark.parametrize(
@@ -242,7 +244,9 @@ def test_a_part_of_a_panorama_needs_no_mask(narrow: Path) -> None:
     mask[16:19, 32:64] = 255  # 3 of the 16 rows that the pictures show
     _save(narrow, "mask.png", mask)
     notes = check(narrow, options=DataOptions(mask="mask.png")).notes
-    assert any("the masks of 6 views hide more than 75% of the image: pano_00 (81.2%)" in note for note in notes), notes
+    assert any("the masks of 6 views hide more than 75% of the sphere: pano_00 (82.1%)" in note for note in notes), (
+        notes
+    )
 
 
 def _shuffle_colours(folder: Path) -> None:

@@ -180,7 +180,6 @@ def test_a_folder_of_depths_states_what_it_holds(unit: float, world: World, tmp_
 @pytest.mark.parametrize(
     ("statement", "values", "message"),
     [
-        (None, np.ones((4, 8)), "holds depth maps, but there is no depth.json that says what they hold; write"),
         ('{"measure": "z"}', np.ones((4, 8)), "holds z .* but pano_00.png is a panorama, which has no such axis"),
         ('{"measure": "metres"}', np.ones((4, 8)), "depth.json does not say .*'metres'.*; write .*ray"),
         ('{"measure": "ray", "unit": 0}', np.ones((4, 8)), "does not say what the depth maps hold .*unit 0"),
@@ -206,10 +205,24 @@ def test_unknown_or_damaged_depths_are_refused(statement, values, message, world
         file.write_bytes(values)
     else:
         np.save(file, values)
-    if statement:
-        (tmp_path / "depths" / "depth.json").write_text(statement)
+    (tmp_path / "depths" / "depth.json").write_text(statement)
     with pytest.raises(DataError, match=message):
         load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["depths", "depth"])
+@pytest.mark.parametrize("content", [b"\x93NUMPY cut", None])
+def test_a_folder_of_depths_without_a_statement_is_not_used(name: str, content, world: World, tmp_path: Path):
+    write_colmap_text(world, tmp_path)
+    (tmp_path / name).mkdir()
+    file = tmp_path / name / f"{world.names[0]}.npy"
+    file.write_bytes(content) if content else np.save(file, np.ones((4, 8)))
+    scene = load(tmp_path)
+    assert not any(view.load_depth for view in (*scene.train, *scene.test))
+    assert any(f"/{name} is not used: no depth.json says what its maps hold; to use" in note for note in scene.notes)
+    assert check(tmp_path).problems == []
+    with pytest.raises(ValueError, match=r"train.depth_weight is not 0, but no training view has a depth map"):
+        Targets(scene.train, "none", depth="measured")
 
 
 def test_depth_maps_in_tiff_files_and_folders_that_are_not_used(world: World, tmp_path: Path):

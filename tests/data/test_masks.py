@@ -15,6 +15,7 @@ from support.fixtures import World, write_colmap_text, write_transforms
 from padgs.data import DataError, load
 from padgs.data.check import check
 from padgs.data.masks import row_weights, write_masks
+from padgs.data.prepare.work import Prepared, PrepareOptions
 
 
 @pytest.fixture
@@ -111,13 +112,66 @@ def test_inverted_masks_are_asked_about_and_inverted(folder: Path) -> None:
     assert len({plain, *(load(folder, mask=spec).fingerprint for spec in ("masks", "inverted"))}) == 3
     with pytest.raises(DataError, match="data.mask=inverted:none: there are no mask files to invert"):
         load(folder, mask="inverted:none")
-    (folder / "prepare.json").write_text("{}")  # of `padgs prepare`, which writes masks of narrow crops
+
+
+def test_masks_that_prepare_wrote_may_hide_most_and_others_are_asked_about(folder: Path) -> None:
+    prepared = Prepared(folder, (), (), 0, 0)
+    prepared.write(folder, PrepareOptions(), "")
+    for name in ("pano_00", "pano_01", "pano_02"):
+        _mask(folder / "masks" / f"{name}.png", hidden_rows=26)
+    with pytest.raises(DataError, match="set data.mask=inverted"):  # put there by the user
+        load(folder)
+    prepared.write(folder, PrepareOptions(), "")  # as of narrow crops
     assert load(folder).train[0].mask().mean() == 6 / 32
     assert not [problem for problem in check(folder).problems if "masks" in problem]
+    for name in ("pano_00", "pano_01", "pano_02"):
+        _mask(folder / "masks" / f"{name}.png", hidden_rows=27)
+    with pytest.raises(DataError, match="set data.mask=inverted"):
+        load(folder)
     shutil.rmtree(folder / "masks")
     _mask(folder / "mask.png", hidden_rows=26)
+    prepared.write(folder, PrepareOptions(), "")
     assert load(folder).train[0].mask().mean() == 6 / 32
     assert not [problem for problem in check(folder).problems if "mask" in problem]
+
+
+@pytest.mark.parametrize("masks", ["masks", "mask.png", "images/masks"])
+def test_masks_around_the_images_count_wherever_the_model_is(masks: str, folder: Path) -> None:
+    names = [f"{masks}/pano_0{i}.png" for i in range(6)] if masks != "mask.png" else [masks]
+    for name in names:
+        _mask(folder / name, hidden_rows=26)
+    options = {"images": str(folder / "images")}
+    scene = load(folder / "sparse" / "0", mask="inverted", **options)
+    assert scene.train[0].mask().mean() == 26 / 32 and scene.name == folder.name
+    assert [view.name for view in scene.test] == ["pano_01", "pano_04"]
+    where = "images" if masks.startswith("images") else masks
+    with pytest.raises(DataError, match=f"if that is meant, set data.mask={where}$"):
+        load(folder / "sparse" / "0", **options)
+    assert load(folder / "sparse" / "0", mask=where, **options).train[0].mask().mean() == 6 / 32
+
+
+def test_an_empty_folder_of_masks_is_none(folder: Path) -> None:
+    (folder / "masks").mkdir()
+    (folder / "masks" / ".gitkeep").touch()
+    assert load(folder).train[0].mask() is None
+    _mask(folder / "images" / "masks" / "pano_00.png", hidden_rows=12)
+    assert load(folder).train[0].mask() is not None
+    with pytest.raises(DataError, match="holds no mask named like an image"):
+        load(folder, mask="masks")
+
+
+def test_masks_in_one_folder_serve_images_in_several(world: World, folder: Path) -> None:
+    listing = folder / "sparse/0/images.txt"
+    for name, inside in zip(world.names[:3], ("left/a", "left/b", "right/b"), strict=True):
+        (folder / "images" / inside).parent.mkdir(exist_ok=True)
+        (folder / "images" / f"{name}.png").rename(folder / "images" / f"{inside}.png")
+        for file in (listing, folder / "train.txt", folder / "test.txt"):
+            file.write_text(file.read_text().replace(f"{name}.png", f"{inside}.png"))
+    for name in ("a_mask", "b"):  # two images are called b
+        _mask(folder / "masks" / f"{name}.png", hidden_rows=12)
+    scene = load(folder)
+    masked = [view.name for view in (*scene.train, *scene.test) if view.mask() is not None]
+    assert masked == ["left/a"] and "masks: masks/ for 1 of 6 views; not used: b.png" in scene.notes
 
 
 @pytest.mark.parametrize("file", ["masks/pano_00.png", "images/dynamic_mask_pano_00.png"])
@@ -258,24 +312,11 @@ def test_the_only_value_besides_0_means_use_or_ignore(values: tuple[int, int], m
     torch.testing.assert_close(load(folder, mask="inverted").train[0].mask(), 1 - marked)
 
 
-@pytest.mark.parametrize("ids", [(33, 35), (1, 62, 171, 187, 190), (0, 7, 11, 23, 255), (1, 150)])
-def test_areas_of_labels_are_no_masks(ids: tuple[int, ...], folder: Path) -> None:
-    areas = np.repeat(np.array(ids, np.uint8), 13)[:64]
-    Image.fromarray(np.tile(np.pad(areas, (0, 64 - len(areas)), "edge"), (32, 1))).save(folder / "mask.png")
-    if ids == (0, 7, 11, 23, 255):  # three greys beside black and white may be weights
-        assert load(folder, mask="mask.png").train[0].mask() is not None
-        return
-    with pytest.raises(
-        DataError, match=rf"mask.png has areas of {ids[0]}, {ids[1]}.*, as images of labels have; .* 255"
-    ):
-        load(folder)
-
-
 @pytest.mark.parametrize("kind", ["ramp", "noise", "steps", "jpeg"])
 def test_soft_edges_and_weights_are_masks(kind: str, folder: Path) -> None:
     row = np.linspace(0, 255, 64).astype(np.uint8)
     random = np.random.default_rng(0).integers(1, 250, (32, 64)).astype(np.uint8)
-    steps = np.repeat(np.array([0, 85, 170, 255], np.uint8), 16)
+    steps = np.repeat(np.array([0, 50, 100, 150, 200, 255, 255, 255], np.uint8), 8)  # more flat greys than three
     pixels = {"ramp": np.tile(row, (32, 1)), "noise": random, "steps": np.tile(steps, (32, 1))}
     pixels["jpeg"] = np.where(np.hypot(*np.mgrid[-16:16, -32:32]) < 20, np.uint8(0), np.uint8(255))
     file = folder / ("mask.jpg" if kind == "jpeg" else "mask.png")

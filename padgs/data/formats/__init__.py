@@ -33,7 +33,7 @@ NEARLY = {  # names of files that hold a data set in another form, and what to d
     ("*.psx", "*.psz"): "open it in Metashape, and export cameras.xml (File > Export > Export Cameras)",
     ("*.zip", "*.tar*", "*.tgz", "*.7z", "*.rar"): "unpack it, and give its folder",
 }
-SEARCHED = 50  # names in a folder without a format, which are tried instead of it
+SEARCHED = 50  # folders on each level below one without a format, which are tried instead of it
 # Files that may be given instead of their folder.
 ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json", "*.xml", "pano-poses.csv", E57)
 
@@ -44,8 +44,9 @@ def detect(path: Path) -> tuple[str, str]:
         names = [child.name for child in sorted(path.iterdir())] if path.is_dir() else []
         inside = listed(names) if path.is_dir() else "a file"
         above = [str(parent) for parent in list(path.absolute().parents)[2::-1] if _found(parent)][:1]
-        folders = [child for level in ("*", "*/*") for child in sorted(path.glob(level))[:SEARCHED] if child.is_dir()]
-        near = above or [str(folder) for folder in folders if _found(folder)] or [str(xml) for xml in xml_files(path)]
+        levels = (sorted(filter(Path.is_dir, path.glob(level)))[:SEARCHED] for level in ("*", "*/*"))
+        inner = [folder for folders in levels for folder in folders if _found(folder) and find_model(folder) != folder]
+        near = [*map(str, [*inner, *xml_files(path)]), *above]
         hint = f", but {listed(near)} {'has: give that' if len(near) == 1 else 'have: give one'}" if near else ""
         for ends, way in NEARLY.items():
             others = [name for name in [path.name, *names] if any(fnmatch(name.lower(), end) for end in ends)]

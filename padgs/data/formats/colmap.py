@@ -73,6 +73,8 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     where = str(files["images"])
     frames = tuple(_frame(image, cameras.get(image.camera), folder, model, where) for image in images)
     notes = _file_notes(path, model, files, colored is not None)
+    if files["images"].suffix.lower() == ".bin" and (stated := _count(files["images"])) > len(images):
+        notes.append(f"images.bin states {stated} images and holds {len(images)}, as some versions of COLMAP write it")
     tracks = partial(_tracks, images, row_of)
     return Capture("colmap", path, folder, frames, cloud, tracks=tracks, notes=tuple(notes))
 

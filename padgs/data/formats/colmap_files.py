@@ -182,10 +182,12 @@ class _Cursor:
 
 def _entries(file: Path, entry: Callable[[_Cursor], T]) -> list[T]:
     """Read the entries of a binary file; a DataError if it is truncated, or longer than its entries."""
-    cursor = _Cursor(file)
+    cursor, found = _Cursor(file), list[T]()
     try:
         (count,) = cursor.take("Q")
-        found = [entry(cursor) for _ in range(count)]
+        half = count / 2 if file.stem.lower() == "images" else None  # of what COLMAP's pull request 4295 mends
+        while len(found) < count and not (len(found) == half and cursor.offset == len(cursor.data)):
+            found.append(entry(cursor))
     except (struct.error, IndexError, OverflowError) as error:
         raise DataError(f"{file} ends early or is not a COLMAP file; copy it again or rebuild the model") from error
     if cursor.offset != len(cursor.data):

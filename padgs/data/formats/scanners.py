@@ -5,9 +5,12 @@ files hold panoramas, poses and points.
 """
 
 import csv
+import hashlib
+import json
 import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ from padgs.data.scans import open_e57
 from padgs.data.splits import check_name, read_lines
 from padgs.files import write_atomically
 
+WRITTEN = ".padgs-written.json"  # digests by name of the pictures that padgs wrote
 COLUMNS = ("pano_pos_x", "pano_pos_y", "pano_pos_z", "pano_ori_w", "pano_ori_x", "pano_ori_y", "pano_ori_z")
 
 
@@ -65,8 +69,8 @@ def read_navvis(path: Path, options: DataOptions) -> Capture:
 def read_e57(path: Path, options: DataOptions) -> Capture:
     """Read panoramas, poses and points of an E57 file, or of all in a folder.
 
-    The images are written to the folder NAME_images beside the file, once. A DataError says that pye57 is missing, that
-    the file is damaged, or that it holds no panoramas or no poses.
+    The images are written to the folder NAME_images beside the file, once; edited ones stay. A DataError says that
+    pye57 is missing, that the file is damaged, or that it holds no panoramas or no poses.
     """
     files = [path] if path.is_file() else files_with(path, ".e57")
     if not files:
@@ -80,13 +84,15 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
     clouds: list[Cloud] = []
     notes: list[str] = []
     folder = root / f"{files[0].stem}_images" if len(files) == 1 else root
+    written: dict[str, str] = {}
+    with suppress(OSError, ValueError, TypeError):
+        written |= json.loads((folder / WRITTEN).read_text(encoding="utf-8"))
     for file in files:
         inside = "" if len(files) == 1 else f"{file.stem}_images/"
-        since = file.stat().st_mtime
         with open_e57(file) as opened:
             for index, (name, image) in enumerate(_named_images(opened)):
                 where = f"images2D[{index}] {name!r} of {file}"
-                frame = _frame(image, where, folder, f"{inside}{name}", since, edited)
+                frame = _frame(image, where, folder, f"{inside}{name}", written, edited)
                 frames += [frame] if frame else []
                 others += [] if frame else [name]
         if options.points == "auto":
@@ -101,8 +107,10 @@ def read_e57(path: Path, options: DataOptions) -> Capture:
             "poses too, or use the file as points of another data set (data.points)"
         )
     notes.append(f"images: {len(frames)} panoramas of {named}, written beside it")
+    with suppress(OSError):  # a read-only folder, which has all pictures
+        write_atomically(folder / WRITTEN, json.dumps(written).encode())
     if edited:
-        notes.append(f"images: {listed(edited)} differ from those of {named}, and are used because they are newer")
+        notes.append(f"images: {listed(edited)} differ from those of {named}, and stay; remove them to get these back")
     cloud, more = joined(clouds)
     notes += more
     cloud = cloud if len(cloud.points) else None
@@ -123,10 +131,10 @@ def _named_images(opened: Any) -> Iterator[tuple[str, Any]]:
         yield name, image
 
 
-def _frame(image: Any, where: str, folder: Path, name: str, since: float, edited: list[str]) -> Frame | None:
+def _frame(image: Any, where: str, folder: Path, name: str, written: dict[str, str], edited: list[str]) -> Frame | None:
     """Write the picture of a panorama, unless it is there, and return its frame; None for other images.
 
-    Pictures that differ and are newer than the E57 file, which is of `since`, stay; their names go to `edited`.
+    `written` are the digests of pictures by name. Other pictures stay; their names go to `edited`.
     """
     if not image.isDefined("sphericalRepresentation"):
         return None
@@ -145,24 +153,27 @@ def _frame(image: Any, where: str, folder: Path, name: str, since: float, edited
     center = [pose["translation"][axis].value() for axis in "xyz"]
     suffix = ".jpg" if kind == "jpegImage" else ".png"
     name = name if name.lower().endswith((suffix, ".jpeg")) else f"{name}{suffix}"
-    edited += _write_blob(sphere[kind], folder / name, since)
+    edited += _write_blob(sphere[kind], folder, name, written)
     if sphere.isDefined("imageMask"):
-        edited += _write_blob(sphere["imageMask"], (folder / name).with_name(f"{Path(name).stem}_mask.png"), since)
+        edited += _write_blob(sphere["imageMask"], folder, f"{name.rpartition('.')[0]}_mask.png", written)
     found = cam_from_panorama(torch.tensor(turn, dtype=torch.float64), torch.tensor(center, dtype=torch.float64), where)
     return Frame(name, folder / name, found)
 
 
-def _write_blob(blob: Any, path: Path, since: float) -> list[str]:
-    """Write a picture; return its name instead if a newer one is there."""
-    data = np.zeros(blob.byteCount(), np.uint8)
-    blob.read(data, 0, len(data))
+def _write_blob(blob: Any, folder: Path, name: str, written: dict[str, str]) -> list[str]:
+    """Write a picture and note its digest; return its name instead if one is there that padgs did not write."""
+    buffer = np.zeros(blob.byteCount(), np.uint8)
+    blob.read(buffer, 0, len(buffer))
+    path, data = folder / name, buffer.tobytes()
+    digest = hashlib.sha256(data).hexdigest()
     try:
-        if path.is_file() and path.read_bytes() == data.tobytes():  # the folder may be read-only
-            return []
-        if path.is_file() and path.stat().st_mtime > since:
-            return [path.name]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, data.tobytes())
+        there = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+        if there not in (None, digest, written.get(name)):
+            return [name]
+        if there != digest:  # the folder may be read-only
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, data)
+        written[name] = digest
         return []
     except OSError as error:
         why = error.strerror or error

@@ -9,7 +9,7 @@ from posixpath import commonpath
 
 import torch
 
-from padgs.data.assemble import IMAGE_FOLDERS, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, Reading, UnknownLens, first_of, listed
 from padgs.data.cloud import read_ply
 from padgs.data.depths import HOW
@@ -17,6 +17,7 @@ from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.splits import is_inside
+from padgs.files import IMAGE_FOLDERS, given_path
 
 FILE = "transforms.json"
 REDUCED = "reduce_to"  # `Capture.width`, as `padgs split` states it
@@ -70,11 +71,12 @@ def read(path: Path, options: DataOptions) -> Capture:
     if prefix:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
-    named, mask = first.get("ply_file_path"), first.get("mask")
-    cloud, readings = None, tuple[Reading, ...]()
-    # With another source of points a missing or damaged file does not matter.
-    if options.points == "auto" and (stored := named.path_in(folder) if named else first_of(folder, _PLY)):
-        cloud, readings = read_ply(stored), _READINGS if stored.name.lower() == LICHTFELD else ()
+    named, mask, stored = first.get("ply_file_path"), first.get("mask"), given_path(options.points, folder)
+    if options.points == "auto":  # with another source of points a missing or damaged file does not matter
+        stored = named.path_in(folder) if named else first_of(folder, _PLY)
+    cloud = read_ply(stored) if stored and options.points == "auto" else None
+    is_turned = stored and stored.name.lower() == LICHTFELD and stored.parent.resolve().is_relative_to(folder.resolve())
+    readings = _READINGS if is_turned else ()
     meant = mask.text() if mask else "auto"  # as `padgs split` states it
     if len(metas) > 1 and len(unused := [file for name in SIDES["test"] if (file := first_of(folder, (name,)))]) > 1:
         notes = (f"{unused[1].name} is not used: {unused[0].name} has the test views",)

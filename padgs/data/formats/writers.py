@@ -35,13 +35,13 @@ def write_colmap(content: Content, folder: Path) -> None:
     tracks, model = content.tracks or Tracks.from_observations([]), pycolmap.Reconstruction()
     elements: dict[int, list[Any]] = {}  # point -> its track
     cameras: dict[tuple[int, int], int] = {}
-    for image_id, frame in enumerate(content.frames, 1):
+    of_frames = tracks.frame.argsort(stable=True).split(tracks.frame.bincount(minlength=len(content.frames)).tolist())
+    for image_id, (frame, seen) in enumerate(zip(content.frames, of_frames, strict=True), 1):
         size = _size(frame)
         if size not in cameras:
             cameras[size] = len(cameras) + 1
             camera = {"model": "EQUIRECTANGULAR", "width": size[0], "height": size[1], "params": size}
             model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=cameras[size], **camera))
-        seen = tracks.frame == image_id - 1
         pixels = tracks.pixels[seen].numpy()
         image = pycolmap.Image(name=frame.name, keypoints=pixels, camera_id=cameras[size], image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.cam_from_world[:3].numpy()))

@@ -19,7 +19,6 @@ import torch
 from filelock import FileLock, Timeout
 from PIL import Image
 
-from padgs.data.assemble import IMAGE_FOLDERS
 from padgs.data.camera_paths import gravity
 from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, listed, view_name
 from padgs.data.formats import colmap
@@ -30,10 +29,10 @@ from padgs.data.masks import MASK_FOLDERS, write_masks
 from padgs.data.metres import UPRIGHT, Z, moved, refuse_useless, to_metres, write_unit
 from padgs.data.prepare import rig, sfm, work
 from padgs.data.prepare.pairs import image_pairs, similarities
-from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
+from padgs.data.prepare.sources import DAMAGED, Source, extract_frames, find_source, is_video
 from padgs.data.prepare.work import Prepared, PrepareOptions, WorkFolder, digest_of
 from padgs.data.scans import optional_module
-from padgs.files import refuse_working_folder
+from padgs.files import IMAGE_FOLDERS, refuse_working_folder
 from padgs.geometry.similarity import Similarity
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
@@ -221,6 +220,8 @@ class _Job:
         sfm.refine(model, self.threads)
         frames, cloud, tracks = self._panoramas(model)
         notes, partial_folder = list(self.source.notes), self.folder.empty("out")
+        if (damaged := self.work / "frames" / DAMAGED).is_file():
+            notes.append(damaged.read_text(encoding="utf-8"))
         if self.options.level:
             frames, cloud, note = level_world(frames, cloud)
             notes.append(note)

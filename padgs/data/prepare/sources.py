@@ -1,9 +1,8 @@
 """Input of `prepare`: a folder of panoramas with masks, or a 360-degree video, checked before any work is done."""
 
 import hashlib
-import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path, PurePosixPath
@@ -16,10 +15,10 @@ from PIL import Image
 
 from padgs.data import images as image_files
 from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
-from padgs.data.capture import Capture, DataError, Frame, Progress, first_of, listed
+from padgs.data.capture import Capture, DataError, Frame, Progress, listed
 from padgs.data.check import OVERLAY
 from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect, refuse_dual_fisheye
-from padgs.data.masks import MASK_FOLDERS, SCENE_MASKS, Mask, find_masks, is_of_masks, mask_path
+from padgs.data.masks import SCENE_MASKS, Mask, find_masks, is_of_masks, mask_path
 from padgs.data.scans import optional_module
 from padgs.data.splits import check_name
 from padgs.data.store import ImageStore
@@ -34,6 +33,7 @@ _WAYS_OUT = (  # suffixes of unsupported files, and what to do with them
     (VIDEO_EXTENSIONS, "is a video: give its own path, not that of its folder"),
 )
 DECODED = 3  # images checked for dual fisheye; images of one camera are alike
+MAX_DAMAGED, DAMAGED = 0.03, ".damaged"  # share of a video's packets that may be lost; hidden file with a note on them
 _HDR_TRANSFER = {8: "linear", 16: "PQ", 18: "HLG"}  # numbers of ITU-T H.273
 _UNTAGGED = 2  # number of H.273 for colours that the video does not state
 _SD_HEIGHT = 576  # pixels; players take taller untagged videos as BT.709, FFmpeg's conversion all as BT.601
@@ -53,10 +53,10 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     """Write the sharpest frame of every 1 / per_second seconds of a stitched video as frame_00001.jpg, ...; count them.
 
     `progress` is called with (frames decoded, estimated total). A DataError says that the extra `video` is not
-    installed, that the file cannot be decoded, or that its frames are no panoramas.
+    installed, that more than `MAX_DAMAGED` of the file cannot be decoded, or that its frames are no panoramas.
     """
-    seen = set[bytes]()
-    for frame in _sharpest(video, per_second, progress):
+    seen, damaged = set[bytes](), list[bool]()
+    for frame in _sharpest(video, per_second, progress, damaged):
         written = BytesIO()
         Image.fromarray(frame).save(written, "JPEG", quality=95, subsampling=0)
         digest = hashlib.sha256(written.getvalue()).digest()
@@ -67,11 +67,16 @@ def extract_frames(video: Path, folder: Path, per_second: float, progress: Progr
     if len(seen) < 2:
         what = f"{video} gives {len(seen)} different frames at {per_second:g} a second; poses need at least two"
         raise DataError(f"{what}: take more a second (`--per-second`), or a longer video")
+    if lost := sum(damaged):
+        note = f"{lost} of {len(damaged)} packets of {video} cannot be decoded"
+        if lost > MAX_DAMAGED * len(damaged):
+            raise DataError(f"{note}, and at most {MAX_DAMAGED:.0%} are left out: copy or export it again")
+        (folder / DAMAGED).write_text(f"{note}, and are left out", encoding="utf-8")
     return len(seen)
 
 
-def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[NDArray[np.uint8]]:
-    """Yield the sharpest frame [H, W, 3] of every interval of time that has a frame."""
+def _sharpest(video: Path, per_second: float, progress: Progress, damaged: list[bool]) -> Iterator[NDArray[np.uint8]]:
+    """Yield the sharpest frame [H, W, 3] of every interval of time that has a frame; `damaged` is of `_decoded`."""
     av = optional_module("av", video, "video")
     try:
         with av.open(str(video.absolute())) as container:  # a name may begin like a protocol
@@ -82,7 +87,7 @@ def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[ND
             rate = float(stream.average_rate or 30)
             total = stream.frames or round(rate * float((container.duration or 0) / av.time_base))
             best, best_sharpness, interval, start = None, -1.0, 0, None
-            for index, frame in enumerate(container.decode(stream)):
+            for index, frame in enumerate(_decoded(container.demux(stream), av.error.InvalidDataError, damaged)):
                 time = index / rate if frame.time is None else frame.time
                 start = time if start is None else start
                 if index == 0:  # before an hour of decoding
@@ -103,6 +108,16 @@ def _sharpest(video: Path, per_second: float, progress: Progress) -> Iterator[ND
         raise
     except (av.error.FFmpegError, OSError, ValueError, RuntimeError) as error:
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
+
+
+def _decoded(packets: Iterable[Any], damage: type[Exception], damaged: list[bool]) -> Iterator[Any]:
+    """Yield the frames of packets; `damaged` tells for each packet whether it is, and gives no frame."""
+    for packet in packets:
+        damaged.append(False)
+        try:
+            yield from packet.decode()
+        except damage:
+            damaged[-1] = True
 
 
 def _pixels(frame: Any, video: Path) -> NDArray[np.uint8]:
@@ -144,8 +159,8 @@ def find_source(path: Path, mask: str) -> Source:
     """Read and check a folder of panoramas, or one that holds them in images/.
 
     `mask` is as `data.mask`: auto searches for mask.png and masks/ beside the images and beside an images/ folder. A
-    DataError names an unstitched file, fewer than two panoramas, an unusable image or mask, two equal images, or names
-    that differ only in case or extension.
+    DataError names an unstitched file, fewer than two panoramas, unusable images, an unusable mask, two equal images,
+    or names that differ only in case or extension.
     """
     if path.is_file() and path.suffix.lower() in UNSTITCHED:
         raise DataError(f"{path} {_NOT_STITCHED}")
@@ -160,19 +175,22 @@ def find_source(path: Path, mask: str) -> Source:
         found = f"{folder} holds {len(names)} images{f' (left out: {others})' if others else ''}"
         raise DataError(f"{found}; structure from motion needs at least two{ways_out}")
     refuse_clashes(names)
-    images = {name: inspect(folder / name) for name in names}
+    images, bad = dict[str, ImageFile](), list[str]()
+    for name in names:
+        try:
+            images[name] = inspect(folder / name)
+        except DataError as error:
+            bad.append(str(error))
+    if bad:
+        raise DataError(listed(bad, most=3))
     for name in names[:: -(-len(names) // DECODED)]:
         refuse_dual_fisheye(decode(folder / name), folder / name)
     by_digest = {image.digest: name for name, image in images.items()}
     if twins := [f"{name} and {by_digest[of.digest]}" for name, of in images.items() if by_digest[of.digest] != name]:
         raise DataError(f"{folder} holds images that are the same: {listed(twins)}; remove one of each pair")
     no_pose = torch.eye(4, dtype=torch.float64)
-    place = Path(os.path.abspath(path))  # of "." too
-    expected = place.parent if place.name.lower() == "images" and folder == path else path  # of masks
-    if mask in ("auto", "inverted") and not first_of(expected, (*SCENE_MASKS, *MASK_FOLDERS), Path.exists):
-        expected = folder if first_of(folder, SCENE_MASKS) else expected
     frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
-    capture = Capture("images", expected, folder, frames, cloud=None)
+    capture = Capture("images", folder, folder, frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, mask_notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
     notes = [*image_files.notes_on(list(images.values())), *mask_notes]
@@ -183,7 +201,7 @@ def find_source(path: Path, mask: str) -> Source:
     read = {found.file.path for found in masks if found is not None and found.file is not None}
     unused = [name for name in image_names(folder) if name not in images and folder / name not in read]
     if mask == "auto" and (unused := [name for name in unused if PurePosixPath(name).name.lower() != OVERLAY]):
-        rule = f"a mask of all panoramas must be in {expected}, others in masks/ with the names of their panoramas"
+        rule = f"a mask of all panoramas must be in {capture.places[0]}, others in masks/ with their names"
         notes.append(f"not used: {listed(unused)}; {rule}")
     identity = "".join(f"{name}|{image.digest}|" for name, image in images.items()) + repr(digests)
     used = {name: found for name, found in zip(names, masks, strict=True) if found is not None}

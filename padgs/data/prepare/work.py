@@ -17,7 +17,7 @@ from padgs.checks import check, check_known
 from padgs.clock import cores, linux_value
 from padgs.data.assemble import PREPARED
 from padgs.data.capture import DataError, first_of
-from padgs.data.masks import SCENE_MASKS, mask_path
+from padgs.data.masks import SCENE_MASKS, mask_digests, mask_path
 from padgs.data.metres import KnownLength
 from padgs.data.prepare.pairs import PAIRS
 from padgs.data.prepare.sfm import MAPPERS
@@ -100,8 +100,9 @@ class Prepared:
     notes: tuple[str, ...] = ()
 
     def write(self, folder: Path, options: PrepareOptions, digest: str) -> None:
-        """Write prepare.json to a folder; `digest` identifies the input, see `digest_of`."""
+        """Write prepare.json to a folder that has its masks; `digest` identifies the input, see `digest_of`."""
         record = {**asdict(self), "folder": ".", "options": asdict(options), "input": digest}
+        record["masks"] = mask_digests(folder)
         (folder / PREPARED).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
 
 

@@ -54,6 +54,24 @@ def test_damaged_binary_files_are_named(file: str, damage: str, world: World, tm
         load(tmp_path)
 
 
+@pytest.mark.parametrize("file", ["images", "points3D"])
+def test_twice_the_number_of_images_is_what_some_versions_of_colmap_state(
+    file: str, world: World, tmp_path: Path
+) -> None:
+    write_colmap_binary(world, tmp_path)
+    before, path = load(tmp_path), tmp_path / "sparse/0" / f"{file}.bin"
+    content = path.read_bytes()
+    count = int.from_bytes(content[:8], "little")
+    path.write_bytes((2 * count).to_bytes(8, "little") + content[8:])
+    if file == "images":
+        scene = load(tmp_path)
+        assert scene.fingerprint == before.fingerprint
+        assert any("images.bin states 12 images and holds 6, as some versions" in note for note in scene.notes)
+        path.write_bytes((2 * count - 1).to_bytes(8, "little") + content[8:])
+    with pytest.raises(DataError, match=f"{file}.bin ends early"):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize("points", ["", "1 nan 0 0 1 2 3 0.1\n", "1 1e400 0 0 1 2 3 0.1\n"])
 def test_unusable_points_are_refused(points: str, world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)

@@ -391,3 +391,9 @@ def test_points_for_lichtfeld_studio_are_turned_back(turned: bool, world: World,
     scene = load(tmp_path)
     torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float(), atol=1e-5, rtol=0)
     assert any(("turned by 180 degrees" in note) == turned for note in scene.notes if note.startswith("the points are"))
+    for points in ("pointcloud.ply", str(cloud)):
+        named = load(tmp_path, points=points)
+        assert torch.equal(named.points, scene.points) and named.fingerprint == scene.fingerprint
+    (tmp_path / "elsewhere").mkdir()
+    other = cloud.rename(tmp_path / "elsewhere.ply")  # somebody's own cloud, in the world of the poses
+    assert torch.equal(load(tmp_path, points=str(other)).points, scene.points) != turned

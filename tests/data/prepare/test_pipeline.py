@@ -200,10 +200,13 @@ def test_other_input_starts_over(scene, tmp_path):
 
 def test_masked_pixels_have_no_features_and_the_mask_is_copied(scene, tmp_path, monkeypatch):
     """Use a video, whose frames are deleted, so that the mask file must be part of the digest."""
-    frames = scene[1].glob("pano*.png")
-    monkeypatch.setattr(
-        pipeline, "extract_frames", lambda video, folder, *_: [shutil.copy(frame, folder) for frame in frames]
-    )
+
+    def extract(video, folder, *_):
+        (folder / pipeline.DAMAGED).write_text("1 packet is left out")
+        for frame in scene[1].glob("pano*.png"):
+            shutil.copy(frame, folder)
+
+    monkeypatch.setattr(pipeline, "extract_frames", extract)
     video, hands = tmp_path / "tour.mp4", tmp_path / "hands.png"
     video.write_bytes(b"a film")
     mask = np.full((256, 512), 255, np.uint8)
@@ -211,11 +214,12 @@ def test_masked_pixels_have_no_features_and_the_mask_is_copied(scene, tmp_path, 
     Image.fromarray(mask).save(hands)
     options = PrepareOptions(threads=2, level=False, mask=str(hands))
     result = prepare(video, tmp_path / "out", options)
-    assert "mask: hands.png for every view" in result.notes
+    assert {"mask: hands.png for every view", "1 packet is left out"} <= {*result.notes}
     rows = padgs.data.read(tmp_path / "out").tracks().pixels[:, 1]
     assert len(rows) > 300
     assert rows.max() < 161
     assert np.array_equal(np.asarray(Image.open(tmp_path / "out" / "mask.png")), mask)
+    assert [*json.loads((tmp_path / "out" / "prepare.json").read_text())["masks"]] == ["mask.png"]
     assert prepare(video, tmp_path / "out", options).points == result.points
     mask[150:] = 0
     Image.fromarray(mask).save(hands)

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from PIL import Image
 from padgs.data import DataError
 from padgs.data.assemble import PREPARED, SKIPPED
 from padgs.data.prepare import sources
-from padgs.data.prepare.sources import _pixels, extract_frames, find_source, is_video, sharpness
+from padgs.data.prepare.sources import DAMAGED, _pixels, extract_frames, find_source, is_video, sharpness
 from padgs.data.prepare.work import PrepareOptions, fingerprint
 from padgs.results import CONFIG_NAME, PICTURES
 
@@ -69,7 +70,7 @@ def test_masks_overlays_and_renders_are_not_panoramas(tmp_path):
     save(tmp_path / "kitchen" / "mask.png", 255)
     source = find_source(tmp_path, "auto")
     assert list(source.images) == ["a.png", "b.png"]
-    rule = f"a mask of all panoramas must be in {tmp_path}, others in masks/ with the names of their panoramas"
+    rule = f"a mask of all panoramas must be in {tmp_path}, others in masks/ with their names"
     assert source.notes[1:] == (f"not used: kitchen/mask.png; {rule}",)
 
 
@@ -101,6 +102,14 @@ def test_only_what_an_option_names_is_no_panorama(tmp_path):
     half(tmp_path / "None" / "a_mask.png")
     beside = find_source(tmp_path / "None", str(tmp_path / "None"))
     assert (list(beside.images), list(beside.masks)) == (["a.png", "b.png"], ["a.png"]), "the folder of the panoramas"
+
+
+@pytest.mark.parametrize("name", ["images", "imgs", "RGB"])
+def test_masks_beside_a_folder_of_images_are_those_of_its_images(tmp_path, name):
+    for file in (f"{name}/a.png", f"{name}/b.png"):
+        save(tmp_path / file)
+    half(tmp_path / "masks" / "a.png")
+    assert list(find_source(tmp_path / name, "auto").masks) == ["a.png"]
 
 
 def test_a_mask_of_all_panoramas_may_lie_among_them(tmp_path):
@@ -215,6 +224,12 @@ def test_bad_input_is_refused(tmp_path):
     (tmp_path / "A.png").unlink()
     save(tmp_path / "b.png", size=(16, 31))
     refused(r"b.png is 31x16, which is not 2:1")
+    save(tmp_path / "c.png", size=(30, 40))
+    save(tmp_path / "d.png", size=(64, 36))
+    (tmp_path / "e.png").touch()
+    (tmp_path / "f.png").touch()
+    photograph = r"which is not 2:1; .* \(it has the shape of an ordinary photograph: move it elsewhere\)"
+    refused(rf"b.png is 31x16, .*c.png is 40x30, {photograph}, .*d.png is 36x64, {photograph} and 2 more$")
 
 
 def test_videos_are_recognised_by_suffix_and_blur_lowers_sharpness(tmp_path):
@@ -265,6 +280,23 @@ def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
     for name, index in (("frame_00001.jpg", 3), ("frame_00002.jpg", 16)):
         darkest = np.asarray(Image.open(tmp_path / name)).min()
         assert abs(int(darkest) - (40 + 5 * index)) < 12
+
+
+def test_frames_of_damaged_packets_are_left_out(tmp_path):
+    write(tmp_path / "a.mp4", [np.full((64, 128, 3), 2 * index, np.uint8) for index in range(100)])
+    av = pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        places = [(packet.pos, packet.size) for packet in container.demux() if packet.size]
+    content = bytearray((tmp_path / "a.mp4").read_bytes())
+    for count, (at, size) in enumerate(places[10:14], 1):
+        content[at : at + size] = bytes(size)
+        (tmp_path / "a.mp4").write_bytes(content)
+        if count == 2:
+            assert extract_frames(tmp_path / "a.mp4", tmp_path, 1.0) == 10
+            note = (tmp_path / DAMAGED).read_text()
+            assert re.fullmatch(r"2 of 10[01] packets of .*a.mp4 cannot be decoded, and are left out", note)
+    with pytest.raises(DataError, match="4 of 10. packets of .* cannot be decoded, and at most 3% are left out: copy"):
+        extract_frames(tmp_path / "a.mp4", tmp_path, 1.0)
 
 
 def test_equal_frames_of_a_still_are_written_once(tmp_path, monkeypatch):
