@@ -125,19 +125,14 @@ def machine(device: Device = "cpu") -> dict[str, Any]:
         "torch": torch.__version__,
         "cuda": torch.version.cuda if gpu else None,
         "padgs": metadata.version("padgs"),
-        "commit": _commit_at_start(),
+        "commit": commit(),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
 
 
-@cache
-def _commit_at_start() -> str | None:
-    return commit()  # later the files may be of another commit than the running code
-
-
-def commit(folder: Path | None = None) -> str | None:
+@cache  # later the files may be of another commit than the running code
+def commit(folder: Path = Path(__file__).resolve().parent.parent) -> str | None:  # noqa: B008
     """Return the commit of the checkout of this code, with "+" if files differ from it; None outside a checkout."""
-    folder = Path(__file__).resolve().parent.parent if folder is None else folder
     if not (folder / ".git").exists():
         return None  # without this check, an installed package would report whatever repository lies around it
     command = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=40", "--exclude=*"]

@@ -68,7 +68,9 @@ def check_place(path: Path) -> None:
 
 
 def refuse_working_folder(path: Path) -> None:
-    """Raise a ValueError for the working folder or a root, which nothing can replace."""
+    """Raise a ValueError for the working folder, a root or a mount point, which nothing can replace."""
+    if path.name and os.path.ismount(path):
+        raise ValueError(f"{path} is a mount point, which nothing can replace; name a new folder in it")
     if not path.name or (path.is_dir() and path.samefile(Path())):
         raise ValueError(f"{path} is the working folder or a root, which is not replaced; name a new one")
 

@@ -34,16 +34,16 @@ from padgs.results import (
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
-# Options that results of before they existed, or since they ended (hold_out), do not name, and what those runs did.
+# Options that older results do not name, and what those runs did. An option that is None is as one that is missing.
 BEFORE = {"method.length_unit": "extent", "method.means_least_pace": 1.0, "train.random_background": False}
-BEFORE |= {"train.hold_out": None, "render.steepness": 0.0}
-OF_A_SCENE = ("data.", "method.sha256", "method.transform")  # beginnings of keys
+BEFORE |= {"render.steepness": 0.0}
+# Beginnings of keys that scenes may differ in: their data, files of other programs, voxels in their units.
+OF_A_SCENE = ("data.", "method.sha256", "method.transform", "method.voxel_size")
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
 LINEAR = ("omnigs", "odgs", "op43dgs", "sc_omnigs")  # methods with a law of their own for learning rates
 LINEAR_ITERATIONS = 3000
-LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.targets`, without torch
 
 
 def frame(runs: Iterable[Run]) -> DataFrame:
@@ -112,12 +112,7 @@ def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
 
 
 def law(iterations: int, method: str = "") -> float:
-    """Return the factor that `train.learning_rates=run` chooses: √(30 000 / iterations), for `LINEAR` methods 3000 /
-    iterations, in [1, 8]. A copy without torch; a test compares it with the one that trains.
-
-    >>> law(30_000), law(7500), law(100)
-    (1.0, 2.0, 8.0)
-    """
+    """Return the factor of `train.learning_rates=run`, as `Pace` of training, which needs torch; a test compares both."""
     linear = method in LINEAR or (method not in METHODS and outside(method, "RUN_RATES") == "run_linear")
     factor = LINEAR_ITERATIONS / iterations if linear else math.sqrt(PUBLISHED_ITERATIONS / iterations)
     return min(max(factor, 1.0), LARGEST_FACTOR)
@@ -126,31 +121,14 @@ def law(iterations: int, method: str = "") -> float:
 def images_seen(result: Result) -> float | None:
     """Return the number of training pixels seen, repetitions included, in whole panoramas; None where unknown.
 
-    An iteration sees a panorama, views cut from panoramas of as many pixels, or single rays. During the first
-    `method.coarse_share` of a run it may see smaller ones; the length of that part is known only if iterations were
-    requested and all were done.
+    An iteration sees a panorama, as many pixels of its views, or rays; results do not tell how long views were smaller.
     """
     options, share = result.config.get("method", {}), 1.0
-    coarse = options.get("coarse_share", 0.0) if result.width >= 2 * LEAST_WIDTH else 0.0
-    if result.external:
-        share = None
-    elif result.method == "egonerf":
+    if result.method == "egonerf":
         share = options["rays"] / (result.width * result.height) if "rays" in options else None
-    elif coarse:
-        counted = not result.ended and "seconds" not in result.config.get("budget", {})
-        share = 1 - coarse * (1 - coarse_pixels(result.width)) if counted else None
+    elif result.external or (options.get("coarse_share") and result.width >= 1024):
+        share = None
     return None if share is None else share * result.iterations_done
-
-
-def coarse_pixels(width: int) -> float:
-    """Return the mean share of a panorama's pixels that is seen during `method.coarse_share` of a run.
-
-    The second half of that part sees half the width; the first half repeats this scheme with half the width.
-
-    >>> coarse_pixels(512), coarse_pixels(1024), coarse_pixels(2048)
-    (1.0, 0.25, 0.15625)
-    """
-    return 1.0 if width < 2 * LEAST_WIDTH else (1 + coarse_pixels(width // 2)) / 8
 
 
 def decides(key: str) -> bool:
@@ -175,23 +153,15 @@ def values_of(result: Result) -> dict[str, Any]:
 
 def setting(config: Mapping[str, Any]) -> str:
     """Return what of dotted keys and values decides the setting of a run."""
-    return json.dumps({key: value for key, value in config.items() if decides(key)}, sort_keys=True)
+    return json.dumps({k: value for k, value in config.items() if value is not None and decides(k)}, sort_keys=True)
 
 
 def without_data(runs: DataFrame) -> DataFrame:
-    """Return runs whose settings are compared without those of their data, for means over scenes.
-
-    Models of other programs are a file for each scene, and voxels that a data set states are of its units.
-    """
-    kept, voxels = [json.loads(text) for text in runs["setting"]], f"{CONFIG}method.voxel_size"
-    for own in kept:
-        if own.get("method.voxel_size") == own.get("data.voxel_size"):
-            own.pop("method.voxel_size", None)
-    of_methods = [{key: value for key, value in own.items() if not key.startswith(OF_A_SCENE)} for own in kept]
+    """Return runs whose settings are compared without those of their scene, for means over scenes."""
+    kept = [json.loads(text).items() for text in runs["setting"]]
+    of_methods = [setting({key: value for key, value in own if not key.startswith(OF_A_SCENE)}) for own in kept]
     columns = [column for column in runs if column.removeprefix(CONFIG).startswith(OF_A_SCENE)]
-    if voxels in runs and not any("method.voxel_size" in own for own in of_methods):
-        columns.append(voxels)
-    return runs.drop(columns=columns).assign(setting=[*map(setting, of_methods)])
+    return runs.drop(columns=columns).assign(setting=of_methods)
 
 
 def _hardware(result: Result) -> str:

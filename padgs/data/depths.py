@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from padgs.checks import install_command
 from padgs.data.capture import Capture, DataError, DataOptions, DepthMeaning, first_of, listed
 from padgs.data.images import read_bytes, refused_if_damaged
+from padgs.data.scans import optional_module
 from padgs.files import folded, open_image
 from padgs.scene import View
 
@@ -128,11 +128,7 @@ def read_depth(file: Path) -> NDArray[np.float32]:
 def _exr(file: Path) -> NDArray:
     """Read the single channel of an EXR file, or one of three that are equal, as Blender writes depth."""
     try:
-        import OpenEXR  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise DataError(f"{file}: EXR needs OpenEXR: {install_command('exr')}; or set data.depth=none") from error
-    try:
-        channels = OpenEXR.File(str(file), separate_channels=True).channels()
+        channels = optional_module("OpenEXR", file, "exr").File(str(file), separate_channels=True).channels()
         pixels = {name: np.asarray(channel.pixels) for name, channel in channels.items() if name != "A"}
     except RuntimeError as error:
         raise DataError(f"{file} is no usable EXR file ({error}); export it again") from error

@@ -108,8 +108,7 @@ def diagnose(
     if view.load_depth is not None and not view.depth_is_relative:
         depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
         truth = truth if mask is None else torch.where(mask > 0, truth, 0.0)
-        metrics["depth_error"] = finite_or_none(depth_error(depth, truth))
-        metrics["depth_within"] = finite_or_none(depth_within(depth, truth))
+        metrics["depth_error"], metrics["depth_within"] = depth_scores(view, rendering, mask).values()
         metrics["floaters"] = finite_or_none(floaters(depth, 1 - rendering.transmittance, truth))
         metrics["least_extent"] = finite_or_none(least_extent(depth, truth))
     return metrics

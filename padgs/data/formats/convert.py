@@ -1,6 +1,5 @@
 """Conversion between formats: read and check everything, write to a temporary folder, then rename it."""
 
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import inspect, save_png
 from padgs.data.masks import MASK_FOLDERS, MAX_HIDDEN, SCENE_MASKS, write_masks
 from padgs.data.metres import KnownLength, moved, to_metres, unit_note, write_unit
-from padgs.files import draft_of
+from padgs.files import draft_of, refuse_working_folder
 from padgs.scene import Scene
 
 
@@ -41,8 +40,7 @@ def convert(
         raise ValueError(f"unknown format {to!r}; known: {', '.join(WRITERS)}")
     if destination.is_symlink():
         destination = destination.resolve()
-    if destination.name and os.path.ismount(destination):
-        raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
+    refuse_working_folder(destination)
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another path")
     capture = padgs.data.read(source, format, options)

@@ -5,7 +5,6 @@ when it is complete.
 """
 
 import math
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -97,8 +96,6 @@ def place_of(destination: Path) -> Path:
 
 def _existing(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
     """Return the result of an earlier call; None if the destination is free, a DataError if something else is there."""
-    if destination.name and os.path.ismount(destination):
-        raise DataError(f"{destination} is a mount point, which nothing can replace; name a new folder in it")
     if not destination.exists() or (destination.is_dir() and not any(destination.iterdir())):
         refuse_working_folder(destination)
         return None

@@ -1,7 +1,7 @@
 """Synthetic scenes with exact ground truth: an analytic world, ray-cast into panoramas.
 
 `generate(SyntheticOptions()) -> Scene` renders (or reads from the cache) panoramas, poses and a noisy point cloud;
-`SyntheticTruth` gives exact depth, object ids and poses, and renders new views. World frame: z up, x and y horizontal,
+`SyntheticTruth` gives exact depth and poses. World frame: z up, x and y horizontal,
 one unit per metre unless `world_scale` changes that.
 """
 

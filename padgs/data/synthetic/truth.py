@@ -1,4 +1,4 @@
-"""Exact ground truth of a synthetic scene: poses without noise, radial depth, object ids, and new views."""
+"""Exact ground truth of a synthetic scene: poses without noise, and radial depth of any view."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -67,11 +67,6 @@ class SyntheticTruth:
         """Return distances [H, W] float64 to the surface at pixel centres, in world units; inf = sky."""
         distance, _ = camera.trace(self.world, self._pose(view), view.width)
         return torch.from_numpy(distance * self.options.world_scale)
-
-    def image(self, view: View) -> Tensor:
-        """Render the panorama [H, W, 3] uint8 of a view at any pose, without exposure changes."""
-        pose = self._pose(view)
-        return torch.from_numpy(camera.draw(self.world, pose, view.width, self.options.samples, self.options.seed))
 
     @cached_property
     def median_depth(self) -> float:

@@ -61,12 +61,9 @@ class EgoNeRFOptions:
     fine_samples: int = 128  # importance samples of each ray
     min_weight: float = 0.0  # ours: samples with smaller weights are not shaded but black
     surroundings: str = "auto"  # indoor | outdoor | auto: by the cloud, see `surroundings_of`
-    density_shift: float | None = None  # density = softplus(feature + shift)
-    distance_scale: float | None = None  # optical depth = density x scale x length
     near: float | None = None  # distance of the first sample
     far: float | None = None  # distance of the last sample
     first_radius: float | None = None  # radius of the first node, and shortest interval between nodes or samples
-    environment: bool | None = None  # environment map as background; else black
     environment_height: int = 1920  # rows of the environment map; twice as many columns
     samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
     rays: int = 4096  # rays of an iteration
@@ -91,7 +88,6 @@ class EgoNeRFOptions:
                     f"near is {near}, far {far} and first_radius {first_radius}; near and first_radius must be > 0, "
                     "and far - near larger than first_radius"
                 )
-            check(constants, "> 0", lambda scale: scale > 0, "distance_scale")
         check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
         if self.samples_at_once < self.samples:
             raise ValueError(f"samples_at_once is {self.samples_at_once}, and a ray has {self.samples}; raise it")
@@ -99,9 +95,9 @@ class EgoNeRFOptions:
     def constants(self, surroundings: str) -> Constants:
         """Return the constants for indoor or outdoor; given values replace published ones."""
         published, unit = PUBLISHED[surroundings]
-        published = published.in_units_of(unit)
-        given = {name: getattr(self, name) for name in Constants._fields}
-        return published._replace(**{name: value for name, value in given.items() if value is not None})
+        names = ("near", "far", "first_radius")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return published.in_units_of(unit)._replace(**given)
 
     @property
     def samples(self) -> int:

@@ -24,7 +24,7 @@ from padgs.training.loop import Stage, Trainer
 from padgs.training.model import Model
 from padgs.training.options import Budget, TrainOptions
 
-STEEPNESS = 0.25  # of the response: flatter in the middle and shorter than a Gaussian (`padgs.render.contract`)
+STEEPNESS = 0.25  # of the kernel: flatter in the middle and shorter than a Gaussian (`padgs.render.contract`)
 PIXEL_VARIANCE = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 ROUNDS = 8  # of densification
 DENSIFIED_SHARE = 0.4  # of the run, after which no Gaussians are added

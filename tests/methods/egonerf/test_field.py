@@ -32,7 +32,6 @@ SMALL = EgoNeRFOptions(
     coarse_samples=24,
     fine_samples=24,
     surroundings="outdoor",
-    distance_scale=125.0,
     near=0.05,
     far=8.0,
     first_radius=0.05,
@@ -85,7 +84,8 @@ def test_scene_units_match_published_constants(surroundings, unit, published):
 
 
 def test_constant_density_absorbs_exponentially(generator):
-    model = without_density(replace(SMALL, density_shift=-3.0, environment=False))
+    model = without_density(replace(SMALL, surroundings="indoor"))
+    model.constants = model.constants._replace(density_shift=-3.0, distance_scale=125.0)
     origins, directions = rays(20, generator)
     seen = model.trace(origins, directions)
     distances = model._sample(origins, directions, None)
@@ -96,7 +96,8 @@ def test_constant_density_absorbs_exponentially(generator):
 
 @pytest.mark.parametrize("environment", [True, False])
 def test_empty_space_shows_the_environment_or_black(generator, environment):
-    model = without_density(replace(SMALL, density_shift=-200.0, environment=environment))
+    model = without_density(replace(SMALL, surroundings="outdoor" if environment else "indoor"))
+    model.constants = model.constants._replace(density_shift=-200.0)
     origins, directions = rays(20, generator)
     seen = model.trace(origins, directions)
     behind = model.environment(directions) if environment else torch.zeros(20, 3)
@@ -300,9 +301,9 @@ def test_given_constants_override_those_of_the_surroundings():
     small: dict[str, Any] = {"radial_nodes": 4, "polar_nodes": 4, "azimuth_nodes": 4, "environment_height": 4}
     chosen = EgoNeRF.from_scene(tiny_scene(), EgoNeRFOptions(**small))
     assert chosen.kind == surroundings_of(tiny_scene())
-    options = EgoNeRFOptions(**small, surroundings="indoor", far=7.0, environment=True)
+    options = EgoNeRFOptions(**small, surroundings="indoor", far=7.0)
     model = EgoNeRF.from_scene(tiny_scene(), options)
-    assert model.kind == "indoor" and model.environment is not None
+    assert model.kind == "indoor" and model.environment is None
     assert (model.constants.far, model.constants.density_shift) == (7.0, -8.0)
     with pytest.raises(ValueError, match="unknown surroundings 'cellar'; known: auto, outdoor, indoor"):
         EgoNeRFOptions(surroundings="cellar")
