@@ -112,7 +112,7 @@ def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
 
 
 def law(iterations: int, method: str = "") -> float:
-    """Return the factor of `train.learning_rates=run`, as `Pace` of training, which needs torch; a test compares both."""
+    """Return the factor of `train.learning_rates=run`, as `Pace` of training, which needs torch; tests compare both."""
     linear = method in LINEAR or (method not in METHODS and outside(method, "RUN_RATES") == "run_linear")
     factor = LINEAR_ITERATIONS / iterations if linear else math.sqrt(PUBLISHED_ITERATIONS / iterations)
     return min(max(factor, 1.0), LARGEST_FACTOR)

@@ -300,12 +300,13 @@ def _trained(method: Method, progress: Progress) -> dict[str, Any]:
 
 
 def judge(result: Result, scene: Scene, iterations: int) -> Result:
-    """Return the result as diverged (worse than one colour) or degenerate (depth, thickness), if scores say so."""
+    """Return the result as diverged (worse than one colour), or under stress as degenerate (depth, thickness)."""
     if not result.ok:
         return result
     metrics: dict[str, float | None] = {}
+    is_stressed = result.config.get("stress", {}).get("condition")  # others are in tables whatever they are scored for
     for scores in result.scores.values():
-        metrics |= scores.metrics
+        metrics |= scores.metrics if is_stressed else {}
         known = {name: of for name, view in scores.views.items() if (of := view.get("ws_psnr")) is not None}
         if not known or iterations < MIN_ITERATIONS:
             continue
