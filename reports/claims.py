@@ -218,7 +218,7 @@ def measured(claim: Claim, run_set: RunSet) -> DataFrame:
             row["tested"] &= {*claim.required} <= {*alike.loc[alike["ok"], "preset"]}
             row |= {"place": place, "scene": place.label, "seen": place.seen, "size": size, "length": length}
             row |= {"width": int(size.partition("x")[0]), "iterations": alike["iterations"].max()}
-            row["as published"] = as_published(alike)
+            row["as published"] = as_published(alike.loc[row.pop("runs")])
             row["failed"] = failures(ours.select(runs.loc[runs["place"] == place]))
             kind = place.seen if place.dataset != published.BUILT_IN else ""
             scene = (place.dataset, place.scene.replace(OTHER_PATH, ""), kind)
@@ -244,7 +244,8 @@ def _beside_best(claim: Claim, ours: DataFrame, others: DataFrame, where: str) -
     seeds = len(first), len(rivals[rival])
     tested = min(seeds) >= LEAST_SEEDS and math.isfinite(advantage)  # inf: an exact render
     differs = tested and differ(mean_cell([*first]), mean_cell([*rivals[rival]]), claim.measure.column)
-    return dict(rival=rival, advantage=advantage, differs=differs, tested=tested, seeds=f"{seeds[0]}, {seeds[1]}")
+    compared = {"rival": rival, "runs": [*first.index, *rivals[rival].index], "seeds": f"{seeds[0]}, {seeds[1]}"}
+    return compared | {"advantage": advantage, "differs": differs, "tested": tested}
 
 
 def _numbers(claim: Claim, runs: DataFrame) -> Any:

@@ -37,8 +37,7 @@ WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a
 # Options that older results do not name, and what those runs did. An option that is None is as one that is missing.
 BEFORE = {"method.length_unit": "extent", "method.means_least_pace": 1.0, "train.random_background": False}
 BEFORE |= {"render.steepness": 0.0}
-# Beginnings of keys that scenes may differ in: their data, files of other programs, voxels in their units.
-OF_A_SCENE = ("data.", "method.sha256", "method.transform", "method.voxel_size")
+OF_A_SCENE = ("data.", "method.sha256", "method.transform", "method.voxel_size")  # beginnings of its keys
 ELSEWHERE = "made elsewhere"  # length of training of external models
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0

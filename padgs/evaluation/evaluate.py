@@ -69,8 +69,8 @@ def score(
     rows = protocol.rows(image.shape[0]) if camera is None else image.shape[0]
     if camera is None and protocol.solid_angle:
         mask = cropped_mask(mask, image, protocol)
-    elif rows < image.shape[0]:
-        image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
+    elif rows < image.shape[0]:  # a mask that hides the cut rows alone is left out: LPIPS is then the usual one
+        image, truth, mask = image[:rows], truth[:rows], None if mask is None or mask[:rows].min() == 1 else mask[:rows]
     weight = angle_weight(image, mask, camera)
     metrics: Metrics = dict.fromkeys(protocol.metrics)
     measures = METRICS if camera is None else PHOTOGRAPH_METRICS

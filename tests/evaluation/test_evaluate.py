@@ -120,6 +120,21 @@ def test_paper_cuts_the_bottom_off_and_sphere_hides_it(image, pixels):
     assert sphere["ws_psnr_nadir"] is None  # rows 29 to 31
 
 
+def test_a_mask_of_the_rows_that_are_cut_off_leaves_lpips_as_it_is_without(image, pixels, monkeypatch):
+    seen = []
+
+    def found(image, truth, mask, **_):
+        seen.append(mask)
+        return torch.tensor(0.0)
+
+    monkeypatch.setattr("padgs.evaluation.evaluate.lpips", found)
+    protocol = replace(PROTOCOLS["paper"], bottom_crop=65 / 1024)
+    mask = (torch.arange(H) < protocol.rows(H))[:, None].float().expand(H, W)
+    score(quantized(image), pixels / 255, mask, protocol)
+    score(quantized(image), pixels / 255, mask * (torch.arange(W) > 3), protocol)
+    assert seen[0] is None and seen[1].shape == (29, W)
+
+
 def test_metrics_without_weighted_pixels_are_missing(image, pixels):
     mask = torch.ones(H, W)
     mask[H // 2 :] = 0

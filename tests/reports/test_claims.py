@@ -92,6 +92,8 @@ def test_verdicts():
     assert verdict(against(*WORSE), source=OURS) == FAILS
     as_published = against(*WORSE, width=1920, height=960, iterations=30_000)
     assert verdict(as_published) == FAILS, "only at the paper's size and length"
+    shorter = runs([-9, -9], "egonerf", width=1920, height=960, iterations=30_000)  # of its 100 000
+    assert verdict([*as_published, *shorter], others=["omnigs", "egonerf"]) == FAILS, "it is not the best rival"
     assert verdict(against(WORSE[0], BETTER[0])) == MIXED and verdict(against([0.1, 0.1], [9, 9])) == UNDECIDED
     assert verdict(against([-2, 1.8], BETTER[0])) == UNDECIDED, "scenes disagree within the noise of seeds"
     assert verdict(against(*BETTER, *BETTER[1:], [-0.4, 0.3])) == HOLDS, (
