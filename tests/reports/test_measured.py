@@ -14,7 +14,7 @@ from padgs.multirun.overrides import expand
 from padgs.reports import REPORTS, store
 from padgs.reports.charts import trade_off, trade_off_chart
 from padgs.reports.frame import frame
-from padgs.reports.selection import RunSet
+from padgs.reports.selection import Mixture, RunSet, separate
 from padgs.reports.table import Table
 from padgs.reports.writers import files, markdown
 
@@ -59,7 +59,13 @@ def test_every_other_table_and_chart_is_of_a_report(measured):
 
 
 def test_labels_of_charts_do_not_overlap(found):
-    for made in trade_off.trade_offs(found):
+    while True:  # runs of several machines are apart, as in the report
+        try:
+            every = trade_off.trade_offs(found)
+            break
+        except Mixture as mixture:
+            found = RunSet(separate(found.runs, mixture))
+    for made in every:
         for panel, _, _, texts in trade_off_chart.draw(made)[1]:
             assert texts
             assert_apart(panel, texts)

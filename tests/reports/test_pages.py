@@ -1,12 +1,14 @@
-"""Numbers that are written by hand in the README and the page on padgs+ are those of the measured tables."""
+"""Numbers that are written by hand in the README and in pages are those of the measured tables."""
 
 import re
 from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from statistics import fmean
 
 import pytest
 from scipy.stats import ttest_1samp
 
+ROOT = Path(__file__).resolve().parents[2]
 SCENES = {
     **{name: f"{name} (not tuned on)" for name in ("basement", "plaza")},
     "bare room": r"synthetic-bare\_room (generated, not tuned on)",
@@ -16,17 +18,29 @@ SCENES = {
     **{name: f"{name} (tuned on)" for name in ("bedroom", "flat", "room")},
 }
 NOT_TUNED_ON, TUNED_ON = list(SCENES)[:4], list(SCENES)[4:]
-PUBLISHED = ("OP43DGS, corrected", "ODGS, corrected", "OmniGS, corrected", "SPaGS", "SPaGS, sorted", "PaD-GS")
-TUNED, SAMPLED = "SPaGS, tuned", "SPaGS, tuned, four samples a pixel"
-COMPLETE = "SPaGS, tuned; samples, response, steps and backgrounds of padgs+"
-WS_PSNR, POLE, COUNT = "WS-PSNR ↑", "WS-PSNR pole ↑", "Gaussians"
-SHOWN = {  # row of docs/plus.md -> column of the table, format, factor
-    "WS-PSNR": (WS_PSNR, ".2f", 1),
+LONG = ("basement", "plaza")
+NAMES = {  # in the pages -> in the tables
+    "padgs+": "padgs+",
+    "`spags_complete`": "SPaGS, complete",
+    "`spags_supersampled`": "SPaGS, supersampled",
+    "`spags_tuned`": "SPaGS, tuned",
+    "`spags_sorted`": "SPaGS, sorted",
+}
+COMPLETE, SAMPLED, TUNED, SORTED = list(NAMES.values())[1:]
+WITHOUT_OPTIONS = ("OP43DGS, corrected", "ODGS, corrected", "OmniGS, corrected", "SPaGS", SORTED, "PaD-GS")
+WS_PSNR, POLE, COUNT, FRAME = "WS-PSNR ↑", "WS-PSNR pole ↑", "Gaussians", "ms per frame ↓"
+MEANS = {  # column of docs/plus.md -> column of the table, format, factor
     "PSNR": ("PSNR ↑", ".2f", 1),
     "LPIPS": (r"LPIPS VGG \[0, 1\] ↓", ".3f", 1),
-    "WS-PSNR of the polar bands": (POLE, ".2f", 1),
-    "thousands of Gaussians": (COUNT, ".0f", 1e-3),
-    "ms of a frame": ("ms per frame ↓", ".0f", 1),
+    "WS-PSNR of the poles": (POLE, ".2f", 1),
+    "Gaussians / 1000": (COUNT, ".0f", 1e-3),
+    "frame, ms": (FRAME, ".0f", 1),
+}
+LONG_RUNS = {
+    "WS-PSNR": (WS_PSNR, ".2f", 1),
+    "CPU s": ("CPU s ↓", ".0f", 1),
+    "Gaussians / 1000": (COUNT, ".0f", 1e-3),
+    "frame, ms": (FRAME, ".0f", 1),
 }
 
 
@@ -34,118 +48,178 @@ def cells(line: str) -> list[str]:
     return [re.sub(r"\*\*|</?ins>", "", cell).strip() for cell in line.split("|")[1:-1]]
 
 
-@pytest.fixture(scope="module")
-def after_a_minute(root):
-    """Scene -> method -> column -> mean, of the table after 60 s."""
+def blocks(name: str) -> dict[str, dict[str, dict[str, str]]]:
+    """Title of a block -> method -> column -> text of a measured table."""
     found = {}
-    for block in (root / "reports/measured/equal_time.md").read_text().split("### ")[1:]:
+    for block in (ROOT / "reports" / "measured" / f"{name}.md").read_text().split("### ")[1:]:
         title, _, *lines = (line for line in block.splitlines() if not line.startswith("- "))
         head, _, *rows = (cells(line) for line in lines if line.startswith("|"))
-        means = {row[0].partition(" (n=")[0]: dict(zip(head, row, strict=True)) for row in rows}
-        found[title.partition(", 512x256, 60 s")[0]] = means
-    return lambda scene, method, column: float(found[SCENES[scene]][method][column].split()[0])
+        found[title] = {
+            row[0].partition(" (n=")[0].removesuffix(" †"): dict(zip(head, row, strict=True)) for row in rows
+        }
+    return found
+
+
+def number(text: str) -> float:
+    return float(text.split()[0])
+
+
+def text_of(page: str) -> str:
+    return " ".join((ROOT / page).read_text().split())
+
+
+def minus(text: str) -> str:
+    return text.replace("-", "−")
 
 
 def between(values, shown: str) -> str:
-    return f"{min(values):{shown}} to {max(values):{shown}}".replace("-", "−").replace(",", " ")
+    return minus(f"{min(values):{shown}} to {max(values):{shown}}").replace(",", " ")
 
 
-def test_the_table_of_padgs_plus(root, after_a_minute):
-    lines = (root / "docs/plus.md").read_text().splitlines()
-    rows = {row[0]: row[1:] for row in map(cells, lines) if row}
-    heading = next(row for row in map(cells, lines) if row and "`basement`" in row)
-    assert [name.strip("`") for name in heading[1:]] == list(SCENES)
-    complete = [f"{after_a_minute(scene, COMPLETE, WS_PSNR):.2f}" for scene in NOT_TUNED_ON]
-    assert rows["WS-PSNR, `spags_complete`"] == [*complete, *["–"] * len(TUNED_ON)]
-    for title, (column, shown, factor) in SHOWN.items():
-        pairs = ([factor * after_a_minute(scene, method, column) for method in ("padgs+", TUNED)] for scene in SCENES)
-        assert rows[title] == ["/".join(format(value, shown) for value in pair) for pair in pairs], title
+def thousands(count: float) -> str:
+    return f"{round(count, -3):,.0f}".replace(",", " ")
 
 
-def test_the_long_runs_of_padgs_plus(root):
-    blocks = (root / "reports/measured/order.md").read_text().split("### ")
-    rows = {row[0]: row[1:] for row in map(cells, (root / "docs/plus.md").read_text().splitlines()) if row}
-    methods = ("padgs+", TUNED, SAMPLED, "padgs+, one sample a pixel", "SPaGS")
-    shown = {
-        "`basement`, `plaza`: WS-PSNR": (WS_PSNR, ".2f", 1),
-        "CPU seconds": ("CPU s ↓", ".0f", 1),
-        "Gaussians / 1000": (COUNT, ".0f", 1e-3),
-        "frame, ms": ("ms per frame ↓", ".0f", 1),
+class Minute:
+    """The table after a minute."""
+
+    def __init__(self):
+        found = blocks("equal_time")
+        (mean,) = (title for title in found if title.startswith("Average over 4 scenes not tuned on"))
+        self.mean = found[mean]
+        self.of_scene = {name: found[f"{title}, 512x256, 60 s of CPU time"] for name, title in SCENES.items()}
+
+    def of(self, scene: str, method: str, column: str) -> float:
+        return number(self.of_scene[scene][method][column])
+
+    def leads(self, rival, scenes=NOT_TUNED_ON, column: str = WS_PSNR, ours: str = "padgs+") -> list[float]:
+        """Return by how much a method is above a rival, or the best of several, on each scene."""
+        rivals = (rival,) if isinstance(rival, str) else rival
+        return [self.of(s, ours, column) - max(self.of(s, other, column) for other in rivals) for s in scenes]
+
+    def mean_of(self, method: str, column: str) -> float:
+        return number(self.mean[method][column])
+
+
+def long_runs() -> dict[str, dict[str, dict[str, str]]]:
+    """Scene -> method -> column of the runs of 3000 iterations."""
+    found = blocks("order")
+    return {
+        name: next(of for title, of in found.items() if title.startswith(rf"all\_methods: {name}") and "padgs+" in of)
+        for name in LONG
     }
-    found = []
-    for scene in ("basement", "plaza"):
-        title = rf"all\_methods: {scene} (not tuned on), 256x128, 3000 iterations"
-        block = next(block for block in blocks if block.startswith(title))
-        head, _, *lines = (cells(line) for line in block.splitlines() if line.startswith("|"))
-        found.append({line[0].partition(" (n=")[0]: dict(zip(head, line, strict=True)) for line in lines})
-    for title, (column, form, factor) in shown.items():
-        values = [[f"{factor * float(of[m][column].split()[0]):{form}}" for of in found] for m in methods]
-        assert rows[title] == [", ".join(pair) for pair in values], title
-    leads = [float(of["padgs+"][WS_PSNR].split()[0]) - float(of[TUNED][WS_PSNR].split()[0]) for of in found]
-    page = " ".join((root / "docs/plus.md").read_text().split())
-    assert leads[0] < 0.1 and f"ties with `spags_tuned` on `basement` and is {leads[1]:.1f} dB above it on" in page
 
 
-def test_the_table_of_opacity_modulation(root, after_a_minute):
-    lines = (root / "docs/notes/padgs_paper.md").read_text().splitlines()
-    rows = {row[0]: row[1:] for row in map(cells, lines) if row}
+def tables(minute: Minute) -> dict[str, list[list[str]]]:
+    """Return the rows of the tables of docs/plus.md, by the heading of their second column."""
+    in_scenes = {
+        kind: [
+            [name, *(f"{minute.of(scene, method, WS_PSNR):.2f}" for scene in scenes)]
+            for name, method in NAMES.items()
+            if all(method in minute.of_scene[scene] for scene in scenes)
+        ]
+        for kind, scenes in (("`basement`", NOT_TUNED_ON), ("near clutter", TUNED_ON))
+    }
+    for row, method in zip(in_scenes["`basement`"], NAMES.values(), strict=True):
+        row.append(f"{minute.mean_of(method, WS_PSNR):.2f}")
+    means = [
+        [name, *(f"{factor * minute.mean_of(method, column):{form}}" for column, form, factor in MEANS.values())]
+        for name, method in NAMES.items()
+    ]
+    of = long_runs()
+    several = [
+        [name, *(", ".join(f"{k * number(of[s][m][c]):{form}}" for s in LONG) for c, form, k in LONG_RUNS.values())]
+        for name, m in (NAMES | {"SPaGS": "SPaGS"}).items()
+    ]
+    return in_scenes | {"PSNR": means, "WS-PSNR": several}
+
+
+def statements(minute: Minute) -> dict[str, str]:
+    """Return phrases of the README and the pages."""
+    (claim,) = (
+        row
+        for row in map(cells, (ROOT / "docs" / "findings.md").read_text().splitlines())
+        if row[:2] == ["11", "WS-PSNR"]
+    )
+    assert minute.leads(WITHOUT_OPTIONS) == minute.leads(SORTED)
+    ahead = minute.leads(TUNED)
+    p = ttest_1samp(ahead, 0).pvalue
+    everywhere = list(SCENES)
+    gains = minute.leads("PaD-GS", everywhere, ours="PaD-GS, unmodulated")
+    at_poles = minute.leads("PaD-GS", everywhere, POLE, "PaD-GS, unmodulated")
+    assert [scene for scene, gain in zip(everywhere, gains, strict=True) if gain < 0.05] == ["plaza"]
+    assert min(at_poles) > 0
+    cost = between([gain for gain in gains if gain >= 0.05], ".1f")
+    counts = {scene: minute.of(scene, "padgs+", COUNT) for scene in everywhere}
+    furnished = between([round(counts[scene], -3) for scene in ("flat", "bedroom", "room")], ",.0f")
+    fine = " and ".join(thousands(counts[scene]) for scene in ("near clutter", "pole torture"))
+    storey = thousands(counts["basement"])
+    iterations = [10 * round(minute.of(scene, "PaD-GS", "iterations") / 10) for scene in everywhere]
+    unmodulated, modulated = (
+        number(long_runs()["basement"][method][WS_PSNR]) for method in ("PaD-GS, unmodulated", "PaD-GS")
+    )
+    return {
+        "DIFF": f"{minus(claim[2])} dB WS-PSNR, 95 % interval {minus(claim[3])}",
+        "LEADTUNED": f"by {between(ahead, '.1f')} dB, {fmean(ahead):.2f} on average (p = {p:.3f})",
+        "LEADS": between(minute.leads(WITHOUT_OPTIONS), ".1f"),
+        "FRAMES": "A frame takes {:.0f} ms, with `spags_complete` {:.0f}, with `spags_tuned` {:.0f}".format(
+            *(minute.mean_of(method, FRAME) for method in ("padgs+", COMPLETE, TUNED))
+        ),
+        "MODULATION": f"After a minute ({between(iterations, '.0f')} iterations; the paper has 30 000) it costs PaD-GS "
+        f"{cost} dB WS-PSNR on eight of nine scenes and changes nothing on `plaza`; at the poles it costs "
+        f"{between(at_poles, '.1f')} dB on all nine",
+        "MODULATIONLONG": f"After 3000 iterations on `basement` it costs {unmodulated - modulated:.1f} dB",
+        "MODULATIONSHORT": f"it costs {cost} dB WS-PSNR on eight of nine scenes, and {between(at_poles, '.1f')} dB at "
+        "the poles",
+        "COUNTS": f"{thousands(counts['bare room'])} for a bare room, {furnished} for three furnished ones (`flat`, "
+        f"`bedroom`, `room`), {storey} for a storey (`basement`), and {fine} for rooms of fine textures",
+        "FURNISHED": furnished,
+        "STOREY": storey,
+        "RATIO": between([counts[s] / minute.of(s, TUNED, COUNT) for s in everywhere], ".1f"),
+    }
+
+
+USED = {
+    "README.md": ("DIFF", "LEADTUNED", "LEADS", "FRAMES", "MODULATION", "MODULATIONLONG", "COUNTS"),
+    "docs/plus.md": ("DIFF", "LEADTUNED", "LEADS"),
+    "docs/index.md": ("LEADS", "MODULATIONSHORT", "FURNISHED", "STOREY"),
+    "docs/smallest.md": ("FURNISHED", "STOREY", "RATIO"),
+}
+
+
+@pytest.fixture(scope="module")
+def minute():
+    return Minute()
+
+
+@pytest.mark.parametrize("page", USED)
+def test_the_statements_of_a_page(page, minute):
+    text, known = text_of(page), statements(minute)
+    assert [known[name] for name in USED[page] if known[name] not in text] == [], f"write these into {page}"
+
+
+def test_the_tables_of_padgs_plus(minute):
+    lines = [cells(line) for line in (ROOT / "docs" / "plus.md").read_text().splitlines() if line.startswith("|")]
+    for second, rows in tables(minute).items():
+        (start,) = (i for i, line in enumerate(lines) if line[1] == second and line[0] != "without")
+        assert lines[start + 2 : start + 2 + len(rows)] == rows, second
+    better = minute.leads((TUNED, SAMPLED), TUNED_ON)
+    assert f"the better of both is {between(better, '.2f')} dB behind" in text_of("docs/plus.md")
+
+
+def test_the_table_of_opacity_modulation(minute):
+    rows = {row[0]: row[1:] for row in map(cells, (ROOT / "docs/notes/padgs_paper.md").read_text().splitlines()) if row}
     for title, column in (("WS-PSNR", WS_PSNR), ("PSNR", "PSNR ↑"), ("WS-PSNR of the poles", POLE)):
-        pairs = ([after_a_minute(s, method, column) for method in ("PaD-GS, unmodulated", "PaD-GS")] for s in SCENES)
+        pairs = ([minute.of(s, method, column) for method in ("PaD-GS, unmodulated", "PaD-GS")] for s in SCENES)
         assert rows[title] == [" → ".join(f"{value:.2f}" for value in pair) for pair in pairs], title
 
 
-def test_the_answers_of_the_readme(root, after_a_minute):
-    of, scenes = after_a_minute, list(SCENES)
-    leads = [of(s, "padgs+", WS_PSNR) - max(of(s, method, WS_PSNR) for method in PUBLISHED) for s in scenes]
-    ahead, ahead_of_complete = (
-        [of(s, "padgs+", WS_PSNR) - of(s, m, WS_PSNR) for s in NOT_TUNED_ON] for m in (TUNED, COMPLETE)
-    )
-    gains, at_poles = (
-        [of(s, "PaD-GS, unmodulated", column) - of(s, "PaD-GS", column) for s in scenes] for column in (WS_PSNR, POLE)
-    )
-    assert abs(gains[scenes.index("plaza")]) < 0.05
-    counts = {s: round(of(s, "padgs+", COUNT), -3) for s in scenes}
-    furnished = [counts[s] for s in ("flat", "bedroom", "room")]
-    frames = [sum(of(s, method, "ms per frame ↓") for s in NOT_TUNED_ON) / 4 for method in ("padgs+", COMPLETE, TUNED)]
-    text, plus = (" ".join((root / page).read_text().split()) for page in ("README.md", "docs/plus.md"))
-    lead = between(leads[: len(NOT_TUNED_ON)], ".1f")
-    assert f"five published methods by {lead} dB WS-PSNR after a minute on four scenes not tuned on" in plus
-    best = " | ".join(f"{max(of(s, method, WS_PSNR) for method in PUBLISHED):.2f}" for s in scenes)
-    assert f"| WS-PSNR, best published: SPaGS, sorted | {best} |" in plus
-    assert f"| WS-PSNR, `spags_supersampled` | {' | '.join(f'{of(s, SAMPLED, WS_PSNR):.2f}' for s in scenes)} |" in plus
-    least = f"{min(leads[: len(NOT_TUNED_ON)]):.1f} dB"
-    assert f"five published methods are {least} or more behind" in (root / "docs" / "index.md").read_text()
-    over = [of(s, "padgs+", WS_PSNR) - max(of(s, method, WS_PSNR) for method in (TUNED, SAMPLED)) for s in TUNED_ON]
-    p_complete, p_tuned = (ttest_1samp(leads, 0).pvalue for leads in (ahead_of_complete, ahead))
-    difference = f"{fmean(ahead_of_complete):+.2f}".replace("-", "−")
-    level = f"level (mean difference {difference} dB WS-PSNR, p = {p_complete:.2f})"
-    lead_of_tuned = f"by {between(ahead, '.1f')} dB, {fmean(ahead):.2f} on average (p = {p_tuned:.3f})"
-
-    answers = [
-        f"padgs+ and `spags_complete`, SPaGS with all options of padgs+, are {level}",
-        f"padgs+ leads `spags_tuned`, SPaGS without its response, samples, steps and backgrounds, {lead_of_tuned}",
-        f"Five published methods as re-implemented here are {least} or more behind",
-        f"A frame takes {frames[0]:.0f} ms, with `spags_complete` {frames[1]:.0f}, with `spags_tuned` {frames[2]:.0f}",
-        f"({between([10 * round(of(s, 'PaD-GS', 'iterations') / 10) for s in scenes], '.0f')} iterations; the paper",
-        f"{between([gain for gain in gains if gain > 0.05], '.1f')} dB WS-PSNR on eight of nine scenes",
-        "changes nothing on `plaza`",
-        f"costs {between(at_poles, '.1f')} dB on all nine",
-        f"{counts['bare room']:.0f} for a bare room, {between(furnished, '.0f')} for three furnished ones",
-        f"{counts['basement']:.0f} for a storey (`basement`), and {counts['near clutter']:.0f} and "
-        f"{counts['pole torture']:.0f} for rooms of fine textures",
-    ]
-    answers[-2:] = [re.sub(r"(\d)(000)\b", r"\1 \2", answer) for answer in answers[-2:]]
-    assert [answer for answer in answers if answer not in text] == [], "write these into the README"
-    assert f"is {level}" in plus and f"leads `spags_tuned` {lead_of_tuned}" in plus
-    assert f"the better of `spags_tuned` and `spags_supersampled` is {between(over, '.2f')} dB behind" in plus
-
-
-def test_links_to_measured_tables_lead_to_pages_of_the_site(root):
+def test_links_to_measured_tables_lead_to_pages_of_the_site():
     pytest.importorskip("mkdocs")
-    spec = spec_from_file_location("docs_site", root / "docs" / "site.py")
+    spec = spec_from_file_location("docs_site", ROOT / "docs" / "site.py")
     hook = module_from_spec(spec)
     spec.loader.exec_module(hook)
     links = "[a](../reports/measured/order.md#x), ![b](../../reports/measured/c.png), [d](../../docs/plus.md)"
     inside = "[a](measured/order.md#x), ![b](../measured/c.png), [d](../plus.md)"
     assert hook.on_page_markdown(links, page=None) == inside
-    assert "hooks: [docs/site.py]" in (root / "mkdocs.yml").read_text()
+    assert "hooks: [docs/site.py]" in (ROOT / "mkdocs.yml").read_text()
