@@ -2,7 +2,7 @@
 
 For a notebook:
 
-    load_scene      a data set, or without a path the built-in room
+    load_scene      a data set, or without a path the generated room
     make_method     an untrained method by its name; `fit`, then `render`
     Budget          for how long to train
     draw            what a trained method shows of a view, as arrays

@@ -53,7 +53,7 @@ def load(
     """Load the scene of a data set; unusable input is a DataError, an unknown format a ValueError.
 
     Args:
-        path: the data set's folder, or the file that describes it; None generates the built-in room.
+        path: the data set's folder, or the file that describes it; None generates a room.
         format: a name of `LOADERS`, or auto.
         options: the `data` group of the configuration.
         fields: single options by name; they override `options`.

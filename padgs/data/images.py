@@ -32,6 +32,8 @@ FILLING = b"\x55" * 2048  # decodes to a few pixels of a JPEG scan
 FISHEYE_ROWS = 128  # sampled
 OUTSIDE, RIM = 1.06, (0.7, 0.9)
 LABELS = 32  # a mask without a value as large, but with several, holds the numbers of labels
+MIN_AREA = 0.01  # share of a mask that a label covers at least; ramps and soft edges have less of each value
+NEARLY_WHITE = 250  # noise of JPEG files reaches down to it
 COLOURED = 64  # difference of the channels of a coloured pixel of a mask
 BLACK = 24  # largest pixel value that counts as black
 MIN_BLACK_OUTSIDE, MAX_BLACK_RIM = 0.98, 0.5  # shares of the pixels
@@ -179,10 +181,17 @@ def _decode(data: bytes, path: Path, mode: str, within: Crop | None = None) -> N
 
 def _two_valued(mask: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
     """Return a mask with 255 for the only value that it has besides 0, such as 1; a DataError for labels 0, 1, 2."""
-    values = np.bincount(mask.ravel())[1:].nonzero()[0] + 1
+    counts = np.bincount(mask.ravel(), minlength=256)
+    values = counts[1:].nonzero()[0] + 1
     rule = "in a mask 255 means use, 0 means ignore"
     if len(values) > 1 and values[-1] < LABELS:
         raise DataError(f"{path} has no value above {values[-1]}, as images of labels have; {rule}: convert it")
+    corner = mask[:-1, :-1]
+    even = np.bincount(corner[(corner == mask[1:, :-1]) & (corner == mask[:-1, 1:])], minlength=256)
+    is_label = (counts >= MIN_AREA * mask.size) & (even >= 0.5 * counts)
+    labels = is_label[1:NEARLY_WHITE].nonzero()[0] + 1
+    if len(labels) > (3 if counts[255] else 1):  # 255 may stand for no label; few greys beside it are weights
+        raise DataError(f"{path} has areas of {listed(labels)}, as images of labels have; {rule}: convert it")
     is_mark = len(values) == 1 and (values[0] == 1 or mask.min() == 0)  # else one weight for all
     return np.where(mask > 0, np.uint8(255), np.uint8(0)) if is_mark else mask
 

@@ -15,7 +15,7 @@ from padgs.multirun.overrides import root
 from padgs.runs.config import DataConfig, Settings, scene_choices
 
 USAGE = """\
-padgs-run [KEY=VALUE ...]     one run, scored; by default padgs+ on a built-in room
+padgs-run [KEY=VALUE ...]     one run, scored; by default padgs+ on a generated room
 padgs-run -m KEY=A,B ...      one run for each value, or each combination of values
 padgs-run --cfg job           print the configuration, run nothing
 padgs-run --help method=NAME  print this text, with the keys of that method

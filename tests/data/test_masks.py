@@ -316,7 +316,7 @@ def test_the_only_value_besides_0_means_use_or_ignore(values: tuple[int, int], m
 def test_soft_edges_and_weights_are_masks(kind: str, folder: Path) -> None:
     row = np.linspace(0, 255, 64).astype(np.uint8)
     random = np.random.default_rng(0).integers(1, 250, (32, 64)).astype(np.uint8)
-    steps = np.repeat(np.array([0, 50, 100, 150, 200, 255, 255, 255], np.uint8), 8)  # more flat greys than three
+    steps = np.repeat(np.array([0, 85, 170, 255], np.uint8), 16)
     pixels = {"ramp": np.tile(row, (32, 1)), "noise": random, "steps": np.tile(steps, (32, 1))}
     pixels["jpeg"] = np.where(np.hypot(*np.mgrid[-16:16, -32:32]) < 20, np.uint8(0), np.uint8(255))
     file = folder / ("mask.jpg" if kind == "jpeg" else "mask.png")
@@ -371,3 +371,16 @@ def test_masks_of_whole_images_fit_reduced_ones(world: World, tmp_path: Path) ->
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     mask = load(tmp_path, images="images_2").train[0].mask()
     assert mask is not None and mask.shape == (16, 32) and mask[:12].eq(1).all() and mask[12:].eq(0).all()
+
+
+@pytest.mark.parametrize("ids", [(33, 35), (1, 62, 171, 187, 190), (0, 7, 11, 23, 255), (1, 150)])
+def test_areas_of_labels_are_no_masks(ids: tuple[int, ...], folder: Path) -> None:
+    areas = np.repeat(np.array(ids, np.uint8), 13)[:64]
+    Image.fromarray(np.tile(np.pad(areas, (0, 64 - len(areas)), "edge"), (32, 1))).save(folder / "mask.png")
+    if ids == (0, 7, 11, 23, 255):  # three greys beside black and white may be weights
+        assert load(folder, mask="mask.png").train[0].mask() is not None
+        return
+    with pytest.raises(
+        DataError, match=rf"mask.png has areas of {ids[0]}, {ids[1]}.*, as images of labels have; .* 255"
+    ):
+        load(folder)

@@ -95,8 +95,7 @@ class EgoNeRFOptions:
     def constants(self, surroundings: str) -> Constants:
         """Return the constants for indoor or outdoor; given values replace published ones."""
         published, unit = PUBLISHED[surroundings]
-        names = ("near", "far", "first_radius")
-        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        given = {name: v for name in ("near", "far", "first_radius") if (v := getattr(self, name)) is not None}
         return published.in_units_of(unit)._replace(**given)
 
     @property
@@ -286,8 +285,8 @@ class EnvironmentMap(nn.Module):
 def surroundings_of(scene: Scene) -> str:
     """Return indoor or outdoor, by the cloud: indoors nearly all points are about as far away as the median one.
 
-    Ours. 95 % of the points were within 1.4 to 2.4 scene units in nine rooms (built-in, scanned and reconstructed),
-    within 5.7 in a garden and 41 in the built-in outdoor scene. A random cloud looks like a room.
+    Ours. 95 % of the points were within 1.4 to 2.4 scene units in nine rooms (generated, scanned and reconstructed),
+    within 5.7 in a garden and 41 in the generated outdoor scene. A random cloud looks like a room.
     """
     return "indoor" if cloud_reach(scene) <= MAX_ROOM_REACH else "outdoor"
 
